@@ -24,14 +24,15 @@ from gpvo.files import replacing
 
 def picture(e: Evaluation, of: Drawing) -> Figure:
     """Panels of a run column by column, under their title."""
-    figure = _figure(of.of(e), of.size, columns=of.columns, shared=of.shared)
+    figure = figure_of(of.of(e), of.size, columns=of.columns, shared=of.shared)
     figure.suptitle(f"{e.run.name}: {of.title.format(method=e.shown_method)}")
     return figure
 
 
-def _figure(
+def figure_of(
     drawn: Sequence[Panel], size: tuple[float, float], *, columns: int = 1, shared: bool = False, **options: Any
 ) -> Figure:
+    """Panels column by column. ``shared``: one axis of time for each column; ``options``: of ``Figure.subplots``."""
     figure, rows = Figure(figsize=size, layout="constrained"), max(-(-len(drawn) // columns), 1)
     grid = figure.subplots(rows, columns, sharex="col" if shared else False, squeeze=False, **options)
     for k, panel in enumerate(drawn):
@@ -106,7 +107,7 @@ def forecast(f: Forecast, title: str) -> Figure:
         panels.panel(title, f"{names[0]} [m]", f"{names[1]} [m]", lines, equal=True),
         panels.panel("", "distance [m]", "sigma of the position [m]", along),
     )
-    return _figure(drawn, (8, 8), height_ratios=(2, 1))
+    return figure_of(drawn, (8, 8), height_ratios=(2, 1))
 
 
 def require_picture(path: Path) -> None:
@@ -133,7 +134,7 @@ def plot_fusion(traces: Sequence[Trace], path: Path) -> None:
         _innovations(traces),
     )
     path.parent.mkdir(parents=True, exist_ok=True)
-    save(_figure(drawn, (11, 9)), path, dpi=120, bbox_inches="tight")
+    save(figure_of(drawn, (11, 9)), path, dpi=120, bbox_inches="tight")
 
 
 def _innovations(traces: Sequence[Trace]) -> Panel:

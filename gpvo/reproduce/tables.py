@@ -11,7 +11,8 @@ from typing import Any
 import numpy as np
 from matplotlib.figure import Figure
 
-from gpvo.evaluation.plots import save
+from gpvo.evaluation.panels import line, panel
+from gpvo.evaluation.plots import figure_of, save
 from gpvo.files import columns_of, make_folder, markdown_table
 from gpvo.reproduce.bounds import Bounds
 from gpvo.reproduce.models import Studies
@@ -180,28 +181,15 @@ def bounds_figure(title: str, columns: Mapping[str, Bounds]) -> Figure:
 
     Ways share the scale of an axis; a bound far beyond all errors is cut, and its reach printed.
     """
-    figure = Figure(figsize=(3.6 * len(columns) + 0.6, 6.6), layout="constrained")
-    grid = figure.subplots(3, len(columns), sharex=True, squeeze=False)
-    for i, axis in enumerate(_AXES):
-        limit = _limit(list(columns.values()), i)
-        for j, (name, b) in enumerate(columns.items()):
-            ax = grid[i][j]
-            reach = 3 * b.sigma_m[:, i]
-            ax.fill_between(b.t_s, b.mean_m[:, i] - reach, b.mean_m[:, i] + reach, color=_GREEN, alpha=0.22, lw=0)
-            ax.plot(b.t_s, b.mean_m[:, i], color=_GREEN, lw=0.8)
-            ax.plot(b.t_s, b.error_m[:, i], color="black", lw=1.1)
-            ax.set_ylim(-limit, limit)
-            ax.grid(alpha=0.3)
-            if reach.max() > limit:
-                ax.text(0.03, 0.93, f"bound up to ±{reach.max():.2g} m", transform=ax.transAxes, fontsize=8, va="top")
-            if i == 0:
-                ax.set_title(name, fontsize=10)
-            if j == 0:
-                ax.set_ylabel(f"{axis} [m]")
-            else:
-                ax.tick_params(labelleft=False)
-    for ax in grid[-1]:
-        ax.set_xlabel("time [s]")
+    drawn = []
+    for name, b in columns.items():
+        for i, axis in enumerate(_AXES):
+            mean, reach, limit = b.mean_m[:, i], 3 * b.sigma_m[:, i], _limit(list(columns.values()), i)
+            band = {"x": b.t_s, "low": mean - reach, "high": mean + reach, "colour": _GREEN}
+            lines = [line(b.t_s, mean, "", _GREEN, 0.8), line(b.t_s, b.error_m[:, i], "", "black", 1.1)]
+            told = [name] * (i == 0) + [f"bound up to ±{reach.max():.2g} m"] * bool(reach.max() > limit)
+            drawn.append(panel(", ".join(told), "time [s]", f"{axis} [m]", lines, bands=[band], limit=[-limit, limit]))
+    figure = figure_of(drawn, (3.6 * len(columns) + 0.6, 6.6), columns=len(columns), shared=True)
     figure.suptitle(title, fontsize=11)
     return figure
 
