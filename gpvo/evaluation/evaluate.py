@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 from pathlib import Path
 
@@ -75,9 +75,9 @@ class Evaluation:
     covered: NDArray[np.bool_]
     T_est: Array
     T_true: Array
-    truth_sigma: Array
-    truth_sigma_stated: Array
-    time_offset_s: float
+    truth_sigma: Array = field(default_factory=lambda: np.zeros(6))
+    truth_sigma_stated: Array = field(default_factory=lambda: np.zeros(6))
+    time_offset_s: float = 0.0
     tells_from_m: float = 0.0
     turned: FixedRotation | None = None
     inverse: InversePoses | None = None
@@ -219,8 +219,7 @@ def unjudged_run(run: Run, predictor: Predictor | None = None, misfits: tuple[st
     """
     predictions, misfits = predictions_of(run, predictor), _misfits(run, predictor, misfits)
     run = replace(run, log=judged(run.log, predictions))
-    T_est, noiseless = run.log.trajectory(), np.zeros(6)
-    none = np.zeros((0, 4, 4))
+    T_est, none = run.log.trajectory(), np.zeros((0, 4, 4))
     length = float(se3.path_length_m(T_est[:, :3, 3])[-1])
     return Evaluation(
         run=run,
@@ -231,9 +230,6 @@ def unjudged_run(run: Run, predictor: Predictor | None = None, misfits: tuple[st
         covered=np.zeros(len(run.log), bool),
         T_est=T_est,
         T_true=np.full_like(T_est, np.nan),
-        truth_sigma=noiseless,
-        truth_sigma_stated=noiseless,
-        time_offset_s=0.0,
         in_domain=_in_domain(predictions),
         misfits=misfits,
     )

@@ -22,10 +22,11 @@ def variances(C: Array) -> Array:
     return np.asarray(np.diagonal(C, axis1=-2, axis2=-1))
 
 
-def is_symmetric(C: Array) -> bool:
-    """Whether one (n, n) matrix is symmetric to rounding: of an element, or of those that were summed up to it."""
+def is_symmetric(C: Array) -> NDArray[np.bool_]:
+    """(...) which (..., n, n) are symmetric to rounding: of an element, or of those that were summed up to it."""
     size = np.abs(C)
-    return bool((np.abs(C - C.T) <= _SKEW * size + _SKEW_OF_SUM * size.max()).all())
+    allowed = _SKEW * size + _SKEW_OF_SUM * size.max(axis=(-2, -1), keepdims=True)
+    return np.asarray((np.abs(C - np.swapaxes(C, -1, -2)) <= allowed).all(axis=(-2, -1)))
 
 
 def is_positive_definite(C: Array) -> bool:
@@ -36,12 +37,8 @@ def is_positive_definite(C: Array) -> bool:
 def are_covariances(C: Array) -> NDArray[np.bool_]:
     """(N,) which of (N, n, n) matrices are finite, symmetric to rounding and positive definite."""
     C = np.asarray(C, dtype=np.float64)
-    size = np.abs(C)
-    largest = size.max(axis=(1, 2), initial=0.0)
-    with np.errstate(invalid="ignore"):
-        symmetric = np.abs(C - np.swapaxes(C, 1, 2)) <= _SKEW * size + _SKEW_OF_SUM * largest[:, None, None]
-        # Comparisons with NaN are false.
-        good = (largest < LARGEST) & (variances(C) > 1 / LARGEST).all(axis=1) & symmetric.all(axis=(1, 2))
+    with np.errstate(invalid="ignore"):  # Comparisons with NaN are false.
+        good = (np.abs(C) < LARGEST).all(axis=(1, 2)) & (variances(C) > 1 / LARGEST).all(axis=1) & is_symmetric(C)
     good[good] = _have_roots(C[good])
     return np.asarray(good)
 

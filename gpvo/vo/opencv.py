@@ -8,6 +8,7 @@ both major versions accept nothing else everywhere.
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -104,19 +105,19 @@ def describe(image: Image, points: Points) -> tuple[Points, NDArray[np.uint8]]:
     """
     akaze = cv2.AKAZE.create(nOctaves=1, nOctaveLayers=1)
     keypoints = [cv2.KeyPoint(float(x), float(y), 8.0, -1, 0, 0, 0) for x, y in points]
-    kept, descriptors = akaze.compute(image, keypoints)
-    if descriptors is None:
-        return np.empty((0, 2), np.float32), np.empty((0, 61), np.uint8)
-    return np.array([k.pt for k in kept], np.float32).reshape(-1, 2), descriptors
+    return _places(*akaze.compute(image, keypoints))
 
 
 def features(image: Image, count: int, mask: Image | None) -> tuple[Points, NDArray[np.uint8]]:
     """The strongest AKAZE features at every scale of the image: places (N, 2) and descriptors (N, 61)."""
     # A low threshold: where there is little contrast, the strongest are still the best there is.
-    keypoints, descriptors = cv2.AKAZE.create(threshold=1e-4, max_points=count).detectAndCompute(image, mask)
+    return _places(*cv2.AKAZE.create(threshold=1e-4, max_points=count).detectAndCompute(image, mask))
+
+
+def _places(keypoints: Sequence[Any], descriptors: Any) -> tuple[Points, NDArray[np.uint8]]:
     if descriptors is None:
         return np.empty((0, 2), np.float32), np.empty((0, 61), np.uint8)
-    return np.array([k.pt for k in keypoints], np.float32), np.asarray(descriptors, np.uint8)
+    return np.array([k.pt for k in keypoints], np.float32).reshape(-1, 2), descriptors
 
 
 def match_mutual(a: NDArray[np.uint8], b: NDArray[np.uint8], ratio: float = 0.85) -> NDArray[np.int64]:

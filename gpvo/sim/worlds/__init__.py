@@ -258,7 +258,7 @@ _PARTS: dict[str, type] = {"mesh": Mesh, "lighting": Lighting, "ground": HeightG
 
 def _save_world(world: World, path: Path) -> None:
     """Write a world atomically. Raises OSError or SourceError where the folder cannot be written."""
-    arrays = {f"texture_{k}": texture for k, texture in enumerate(world.textures)}
+    arrays: dict[str, Any] = {f"texture_{k}": texture for k, texture in enumerate(world.textures)}
     arrays |= {name: getattr(world, name) for name in _ARRAYS}
     for part in _PARTS:
         if (whole := getattr(world, part)) is not None:
