@@ -1,9 +1,9 @@
 """The fast front end: corners at half resolution, followed and matched left to right by Lucas-Kanade.
 
 Whole-pixel corners dominate the error of a descriptor pipeline; here a corner only says which patch to follow, and
-every position that enters the motion is the sub-pixel result of aligning that patch (:mod:`gpvo.vo.patches`). Where too little is found near
-the guess, both images are matched afresh by features of every scale (P. Alcantarilla, J. Nuevo, A. Bartoli, "Fast
-explicit diffusion for accelerated features in nonlinear scale spaces", 2013).
+every position that enters the motion is the sub-pixel result of aligning that patch (:mod:`gpvo.vo.patches`). Where
+too little is found near the guess, both images are matched afresh by features of every scale (P. Alcantarilla, J.
+Nuevo, A. Bartoli, "Fast explicit diffusion for accelerated features in nonlinear scale spaces", 2013).
 """
 
 from __future__ import annotations
@@ -51,8 +51,6 @@ class _Seen:
     def __add__(self, other: _Seen) -> _Seen:
         both = ((getattr(self, f.name), getattr(other, f.name)) for f in fields(self))
         return _Seen(*(np.concatenate(pair) for pair in both))
-
-
 
 
 @dataclass
@@ -206,7 +204,8 @@ class KltFrontend:
         visible = moved.in_front & (u >= 0) & (u < w) & (v >= 0) & (v < h) & (d < w)
         visible &= np.abs(A - np.eye(2)).max(axis=(1, 2), initial=0.0) < _MOST_DEFORMED
         A = np.where(visible[:, None, None], A, np.eye(2))
-        slope = np.where(visible[:, None], np.linalg.solve(A.transpose(0, 2, 1), slope[:, :, None])[:, :, 0], seen.slope)
+        there = np.linalg.solve(A.transpose(0, 2, 1), slope[:, :, None])[:, :, 0]
+        slope = np.where(visible[:, None], there, seen.slope)
         return np.where(visible[:, None], np.column_stack([u, v, d]), seen.uvd), A, slope
 
     def _survey(self, half_left: Image, half_right: Image) -> tuple[Points, NDArray[np.float32]]:

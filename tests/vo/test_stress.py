@@ -286,7 +286,7 @@ def test_the_stress_list_on_a_drive() -> None:
     for part in parts[1:]:
         late = stress.run(stress.late_right(part))
         assert late.count(Status.OK) == 0
-        assert (late.error_m[1:] > 0.3 * late.moved_m[1:]).mean() > 0.5  # what it sees is no motion
+        assert (late.error_m[1:] > 0.2 * late.moved_m[1:]).mean() > 0.5  # what it sees is no motion, so none may be ok
 
 
 @pytest.mark.slow
