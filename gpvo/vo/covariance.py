@@ -16,6 +16,7 @@ import numpy as np
 
 from gpvo.geometry import se3
 from gpvo.geometry.covariance import symmetrise
+from gpvo.stats.series import median
 from gpvo.types import Array, StereoCamera
 from gpvo.vo.config import KNOWN_DEPTH_PX, VoConfig, pair_method
 from gpvo.vo.motion import (
@@ -271,7 +272,7 @@ class NoiseEstimator:
     def _shared(self, motion: Motion, white: Whitened) -> float:
         """Least squares over the products ``r_u^2``, ``r_d^2`` and ``r_u r_d`` of all points."""
         G, noise, variance = white.moved.G, motion.noise, motion.scale_px**2
-        C = residual_covariance(G, noise.S, noise.S, noise.persistent)
+        C = white.C
         alone = residual_covariance(G, PointNoise(0.0).S, PointNoise(0.0).S, noise.persistent)
         z2 = (white.z**2).sum(0)
         r = motion.residuals.T * np.sqrt(np.minimum(1.0 / variance, _CUT / np.maximum(z2, 1e-9 * variance)))
@@ -295,7 +296,7 @@ class NoiseEstimator:
         along2 = (g * z).sum(0) ** 2 / np.maximum(g2, 1e-12)
         across2 = 0.5 * ((z * z).sum(0) - along2)
         # Squares are cut off against outliers; the divisors are what a Gaussian has left of its variance.
-        limit = _CUT_ACROSS * float(np.median(across2))
+        limit = _CUT_ACROSS * median(across2)
         sigma2 = max(float(np.minimum(across2, limit).mean()) / _LEFT_ACROSS, 1e-6)
         expected = 1.0 + ratio * g2
         along2 = np.minimum(along2 / sigma2, _CUT_ALONG * expected) / _LEFT_ALONG
