@@ -167,13 +167,13 @@ class KltFrontend:
         (M, 2), and the disparity (M,) and its slope (M, 2) that the motion lets expect.
         """
         config, seen = self._config, reference.seen
-        uvd, A, slope = self._expected(seen, T_prev_cur)
+        uvd, A, h, slope = self._expected(seen, T_prev_cur)
         left = in_light_of(current.left, current.light_left, reference.light_left)
         uv, followed = opencv.track(
             reference.left, left, seen.left_uv, uvd[:, :2], config.klt_window_px, config.klt_levels
         )
         found = followed.copy()
-        near = align(seen.patches[found], left, uv[found], A[found], sheared=False)
+        near = align(seen.patches[found], left, uv[found], A[found], h[found])
         found[found] = near.alike
         return followed, found, near.uv[near.alike], uvd[found, 2], slope[found]
 
@@ -193,9 +193,9 @@ class KltFrontend:
         self._matched, self._new = self._nothing, _New(0, self._nothing, 0)
         return len(kept) + new.detected, current.strong
 
-    def _expected(self, seen: _Seen, T_prev_cur: Array) -> tuple[Array, Array, Array]:
-        """Where a motion puts the points (N, 3), how it deforms their patches (N, 2, 2), and the slope of their
-        disparity there (N, 2); as they were for those it puts out of sight."""
+    def _expected(self, seen: _Seen, T_prev_cur: Array) -> tuple[Array, Array, Array, Array]:
+        """Where a motion puts the points (N, 3), how it deforms their patches, (N, 2, 2) and (N, 2) of :func:`align`,
+        and the slope of their disparity there (N, 2); as they were for those it puts out of sight."""
         moved = transfer(T_prev_cur, seen.uvd, self._camera)
         (u, v, d), G = moved.uvd, moved.G.transpose(2, 0, 1)
         w, h = self._camera.width, self._camera.height
@@ -203,10 +203,16 @@ class KltFrontend:
         slope = G[:, 2, :2] + G[:, 2, 2:] * seen.slope
         visible = moved.in_front & (u >= 0) & (u < w) & (v >= 0) & (v < h) & (d < w)
         visible &= np.abs(A - np.eye(2)).max(axis=(1, 2), initial=0.0) < _MOST_DEFORMED
+        # Depth over that of before is linear in the place and in the disparity, and so over a plane.
+        R, t = T_prev_cur[:3, :3].T, -T_prev_cur[:3, :3].T @ T_prev_cur[:3, 3]
+        c = self._camera
+        by_u, by_v, by_d = R[2, 0] / c.fx_px, R[2, 1] / c.fy_px, t[2] / (c.fx_px * c.baseline_m)
+        depth = R[2, 2] + (seen.uvd - (c.cx_px, c.cy_px, 0.0)) @ (by_u, by_v, by_d)
+        h = np.where(visible, 1.0 / np.where(visible, depth, 1.0), 0.0)[:, None] * ((by_u, by_v) + by_d * seen.slope)
         A = np.where(visible[:, None, None], A, np.eye(2))
         there = np.linalg.solve(A.transpose(0, 2, 1), slope[:, :, None])[:, :, 0]
         slope = np.where(visible[:, None], there, seen.slope)
-        return np.where(visible[:, None], np.column_stack([u, v, d]), seen.uvd), A, slope
+        return np.where(visible[:, None], np.column_stack([u, v, d]), seen.uvd), A, h, slope
 
     def _survey(self, half_left: Image, half_right: Image) -> tuple[Points, NDArray[np.float32]]:
         """Corners of the half-size left image, strongest first, and disparity at a quarter of the size."""
@@ -274,7 +280,7 @@ class KltFrontend:
         A = np.tile(np.eye(2), (len(uv_left), 1, 1))
         A[:, 0] -= slope
         patches = cut(view.left, uv_left, window_px)
-        near = align(patches, view.right_as_left, uv_right, A, sheared=True)
+        near = align(patches, view.right_as_left, uv_right, A)
         uv_right = np.where(near.alike[:, None], near.uv, uv_right)
         d = uv_left[:, 0].astype(np.float64) - uv_right[:, 0]
         row_error = uv_right[:, 1].astype(np.float64) - uv_left[:, 1]

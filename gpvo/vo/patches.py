@@ -65,12 +65,14 @@ def cut(image: Image, uv: Points, window_px: int) -> Patches:
     return out.reshape(len(uv), 3, window_px**2)
 
 
-def align(patches: Patches, image: Image, start: Points, A: Array, *, sheared: bool) -> Aligned:
+def align(patches: Patches, image: Image, start: Points, A: Array, h: Array | None = None) -> Aligned:
     """Patches (N, 3, M), as of :func:`cut`, found in another image near ``start`` (N, 2), deformed by ``A`` (N, 2, 2).
 
-    A pixel at ``o`` from the middle of the patch is seen at ``uv + A o``. ``sheared``: the first row of ``A`` is
-    estimated as well, as in the other camera of a pair, where each row of a patch moves along itself.
+    A pixel at ``o`` from the middle of the patch is seen at ``uv + A o / (1 + h o)``, with ``h`` (N, 2) the growth of
+    depth over the patch. None for a pair's other camera, where each row of a patch moves along itself: then the first
+    row of ``A`` is estimated as well.
     """
+    sheared = h is None
     n, _, m = patches.shape
     size = math.isqrt(m)
     y, x = (o.ravel().astype(np.float32) - (size - 1) // 2 for o in np.indices((size, size)))
@@ -84,9 +86,10 @@ def align(patches: Patches, image: Image, start: Points, A: Array, *, sheared: b
     H[:, range(len(prior)), range(len(prior))] += prior
     gain = np.linalg.inv(H)
     sought = patches[:, 0] - patches[:, 0].mean(axis=1, keepdims=True)
+    nearer = None if h is None else (1.0 / (1.0 + h[:, :1] * x + h[:, 1:] * y)).astype(np.float32)
     uv, A, misfit = start.astype(np.float64), A.copy(), np.zeros((n, 1))
     for _ in range(_STEPS):
-        misfit = _sampled(image, uv, A, x, y)
+        misfit = _sampled(image, uv, A, x, y, nearer)
         misfit -= misfit.mean(axis=1, keepdims=True)
         misfit -= sought
         r = (D @ misfit[:, :, None])[:, :, 0].astype(np.float64)
@@ -101,12 +104,19 @@ def align(patches: Patches, image: Image, start: Points, A: Array, *, sheared: b
     return Aligned(uv.astype(np.float32), A, alike)
 
 
-def _sampled(image: Image, uv: Array, A: Array, x: NDArray[np.float32], y: NDArray[np.float32]) -> NDArray[np.float32]:
-    """(N, M) grey values at ``uv + A (x, y)``, by bilinear interpolation; OpenCV's is rounded to 1/32 of a pixel."""
+def _sampled(
+    image: Image, uv: Array, A: Array, x: Patches, y: Patches, nearer: Patches | None = None
+) -> NDArray[np.float32]:
+    """(N, M) grey values at ``uv + A (x, y) nearer``, by bilinear interpolation; OpenCV's rounds to 1/32 of a pixel."""
     h, w = image.shape
     B, c = A.astype(np.float32), uv.astype(np.float32)
-    u = c[:, :1] + B[:, 0, :1] * x + B[:, 0, 1:] * y
-    v = c[:, 1:] + B[:, 1, :1] * x + B[:, 1, 1:] * y
+    u = B[:, 0, :1] * x + B[:, 0, 1:] * y
+    v = B[:, 1, :1] * x + B[:, 1, 1:] * y
+    if nearer is not None:
+        u *= nearer
+        v *= nearer
+    u += c[:, :1]
+    v += c[:, 1:]
     np.clip(u, 0.0, w - 1.001, out=u)
     np.clip(v, 0.0, h - 1.001, out=v)
     column, row = u.astype(np.int32), v.astype(np.int32)

@@ -12,6 +12,7 @@ from hypothesis import strategies as st
 
 _WINDOW = 15
 _N = 40
+_FLAT = np.zeros((_N, 2))
 
 
 def _texture(seed: int) -> tuple[Array, Array, Array]:
@@ -55,7 +56,7 @@ def test_a_known_deformation_is_followed(seed: int, a: float, b: float, c: float
     A, shift = np.eye(2) + [[a, b], [c, d]], np.array([2.3, -1.6])
     first, second = _pair(seed, A, shift, brighter)
     uv, there, start = _points(seed, A, shift)
-    found = align(cut(first, uv, _WINDOW), second, start, np.tile(A, (_N, 1, 1)), sheared=False)
+    found = align(cut(first, uv, _WINDOW), second, start, np.tile(A, (_N, 1, 1)), _FLAT)
     assert found.alike.mean() > 0.9
     assert np.median(np.abs(found.uv - there)[found.alike]) < 0.03
 
@@ -66,7 +67,7 @@ def test_the_slope_of_a_plane_is_found_with_its_disparity(seed: int, du: float, 
     A, shift = np.array([[1.0 - du, -dv], [0.0, 1.0]]), np.array([-7.4, 0.0])
     first, second = _pair(seed, A, shift)
     uv, there, start = _points(seed, A, shift)
-    found = align(cut(first, uv, _WINDOW), second, start, np.tile(np.eye(2), (_N, 1, 1)), sheared=True)
+    found = align(cut(first, uv, _WINDOW), second, start, np.tile(np.eye(2), (_N, 1, 1)))
     assert found.alike.mean() > 0.8
     assert np.median(np.abs(found.uv - there)[found.alike]) < 0.03
     assert np.median(np.abs(found.A[:, 0] - A[0])[found.alike]) < 0.02
@@ -83,7 +84,7 @@ def test_a_patch_that_grows_is_misplaced_by_a_square() -> None:
             deformed = np.tile(A if known else np.eye(2), (_N, 1, 1))
             again = start
             for _ in range(5):
-                again = align(cut(first, uv, _WINDOW), second, again, deformed, sheared=False).uv
+                again = align(cut(first, uv, _WINDOW), second, again, deformed, _FLAT).uv
             values.append(float(np.median(np.abs(again - there))))
     assert np.mean(error[False]) > 5.0 * np.mean(error[True])
 
@@ -93,8 +94,8 @@ def test_a_patch_that_grows_is_misplaced_by_a_square() -> None:
 def test_patches_beyond_the_border_are_no_error(window_px: int, place: tuple[float, float]) -> None:
     image = np.random.default_rng(0).integers(0, 255, (20, 20)).astype(np.uint8)
     uv = np.array([place], np.float32)
-    for sheared in (False, True):
-        found = align(cut(image, uv, window_px), image, uv, np.eye(2)[None], sheared=sheared)
+    for h in (np.zeros((1, 2)), None):
+        found = align(cut(image, uv, window_px), image, uv, np.eye(2)[None], h)
         assert np.isfinite(found.uv).all()
         assert np.isfinite(found.A).all()
-    assert len(align(cut(image, uv[:0], window_px), image, uv[:0], np.empty((0, 2, 2)), sheared=True).uv) == 0
+    assert len(align(cut(image, uv[:0], window_px), image, uv[:0], np.empty((0, 2, 2))).uv) == 0
