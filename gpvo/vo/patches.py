@@ -87,7 +87,7 @@ def align(patches: Patches, image: Image, start: Points, A: Array, h: Array | No
     gain = np.linalg.inv(H)
     sought = patches[:, 0] - patches[:, 0].mean(axis=1, keepdims=True)
     nearer = None if h is None else (1.0 / (1.0 + h[:, :1] * x + h[:, 1:] * y)).astype(np.float32)
-    uv, A, misfit = start.astype(np.float64), A.copy(), np.zeros((n, 1))
+    uv, A, misfit = start.astype(np.float64), A.copy(), np.zeros_like(sought)
     for _ in range(_STEPS):
         misfit = _sampled(image, uv, A, x, y, nearer)
         misfit -= misfit.mean(axis=1, keepdims=True)
