@@ -73,8 +73,7 @@ def align(patches: Patches, image: Image, start: Points, A: Array, h: Array | No
     row of ``A`` is estimated as well.
     """
     sheared = h is None
-    n, _, m = patches.shape
-    size = math.isqrt(m)
+    size = math.isqrt(patches.shape[2])
     y, x = (o.ravel().astype(np.float32) - (size - 1) // 2 for o in np.indices((size, size)))
     D = patches[:, (1, 2, 1, 1)[: 4 if sheared else 2]]
     if sheared:
@@ -86,8 +85,9 @@ def align(patches: Patches, image: Image, start: Points, A: Array, h: Array | No
     H[:, range(len(prior)), range(len(prior))] += prior
     gain = np.linalg.inv(H)
     sought = patches[:, 0] - patches[:, 0].mean(axis=1, keepdims=True)
-    nearer = None if h is None else (1.0 / (1.0 + h[:, :1] * x + h[:, 1:] * y)).astype(np.float32)
-    uv, A, misfit = start.astype(np.float64), A.copy(), np.zeros((n, 1))
+    # Half the depth within a patch is no plane but a wrong slope.
+    nearer = None if h is None else (1.0 / np.maximum(1.0 + h[:, :1] * x + h[:, 1:] * y, 0.5)).astype(np.float32)
+    uv, A, misfit = start.astype(np.float64), A.copy(), np.zeros_like(sought)
     for _ in range(_STEPS):
         misfit = _sampled(image, uv, A, x, y, nearer)
         misfit -= misfit.mean(axis=1, keepdims=True)

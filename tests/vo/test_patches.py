@@ -61,6 +61,34 @@ def test_a_known_deformation_is_followed(seed: int, a: float, b: float, c: float
     assert np.median(np.abs(found.uv - there)[found.alike]) < 0.03
 
 
+def test_a_plane_that_comes_near_is_seen_in_perspective() -> None:
+    """Over 20 textures under a homography: to 0.03 px at the median, and twice as well as without the perspective."""
+    rng, A, shift = np.random.default_rng(0), np.array([[1.05, 0.0], [0.02, 1.1]]), np.array([0.4, 3.0])
+    error: dict[bool, list[float]] = {True: [], False: []}
+    y, x = np.mgrid[:120, :120].astype(float)
+    for seed in range(20):
+        g = np.array([0.0, -0.02])  # of the whole image; the patch's own follows from where it stands
+        texture = _texture(seed)
+        # The inverse of uv = m + shift + A o / (1 + g o), o = place - m, m the middle.
+        dx, dy = x - 60.0 - shift[0], y - 60.0 - shift[1]
+        M = A[None, None] - np.stack([dx, dy], -1)[..., :, None] * g
+        o = np.linalg.solve(M, np.stack([dx, dy], -1)[..., None])[..., 0]
+        first, second = _seen(texture, x, y), _seen(texture, 60.0 + o[..., 0], 60.0 + o[..., 1])
+        place = rng.uniform(-15.0, 15.0, (_N, 2))
+        depth = 1.0 + place @ g
+        there = 60.0 + shift + place @ A.T / depth[:, None]
+        own_A = A / depth[:, None, None] - (place @ A.T / depth[:, None] ** 2)[:, :, None] * g
+        h = g / depth[:, None]
+        start = (there + rng.uniform(-0.2, 0.2, there.shape)).astype(np.float32)
+        for known, values in error.items():
+            uv, again = (60.0 + place).astype(np.float32), start
+            for _ in range(3):
+                again = align(cut(first, uv, _WINDOW), second, again, own_A, h if known else _FLAT).uv
+            values.append(float(np.median(np.abs(again - there))))
+    assert np.mean(error[True]) < 0.03
+    assert np.mean(error[False]) > 2.0 * np.mean(error[True])
+
+
 @given(seed=st.integers(0, 1000), du=st.floats(-0.2, 0.2), dv=st.floats(-0.3, 0.3))
 def test_the_slope_of_a_plane_is_found_with_its_disparity(seed: int, du: float, dv: float) -> None:
     """Disparity to 0.03 px and slope to 0.02 at the median, from a start of no slope."""
@@ -94,7 +122,7 @@ def test_a_patch_that_grows_is_misplaced_by_a_square() -> None:
 def test_patches_beyond_the_border_are_no_error(window_px: int, place: tuple[float, float]) -> None:
     image = np.random.default_rng(0).integers(0, 255, (20, 20)).astype(np.uint8)
     uv = np.array([place], np.float32)
-    for h in (np.zeros((1, 2)), None):
+    for h in (np.zeros((1, 2)), np.array([[-1.0, 3.0]]), np.array([[-1.0 / 7, 0.0]]), None):
         found = align(cut(image, uv, window_px), image, uv, np.eye(2)[None], h)
         assert np.isfinite(found.uv).all()
         assert np.isfinite(found.A).all()
