@@ -6,7 +6,9 @@
 # make bench  speed and memory, as ratios within one run
 PYTHON ?= python3
 BIN := .venv/bin
-# Bytecode is written when a module is first imported, as most modules of large packages never are.
+# Bytecode is written when a module is first imported, as most modules of large packages never are; also where Python was
+# told not to, as in many containers: each of some hundred commands would compile all that it imports again.
+export PYTHONDONTWRITEBYTECODE :=
 PIP := $(BIN)/python -m pip install --quiet --no-compile --disable-pip-version-check --constraint constraints.txt
 
 .PHONY: demo test lint tests check bench docs dist clean

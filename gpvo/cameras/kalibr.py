@@ -232,16 +232,15 @@ def _right_left(right: dict[str, Any], T_left_imu: Array | None, T_right_imu: Ar
     return chained
 
 
-def read_sensor_pose(path: Path) -> Array:
-    """``T_BS`` (4, 4) of any sensor: sensor to body."""
-    document = read_yaml(path)
+def sensor_pose(document: dict[str, Any], where: Path) -> Array:
+    """``T_BS`` (4, 4) of any sensor's ``sensor.yaml``: sensor to body. CalibrationError where there is none."""
     block = document.get("T_BS")
     if isinstance(block, dict):
-        numbers = get_numbers(block, "data", 16, f"{path}: T_BS")
-        return check_pose(np.reshape(numbers, (4, 4)), "T_BS", path)
+        numbers = get_numbers(block, "data", 16, f"{where}: T_BS")
+        return check_pose(np.reshape(numbers, (4, 4)), "T_BS", where)
     if block is None:
-        raise CalibrationError("lacks the key 'T_BS'", where=path, cure="add the sensor's pose in the body")
-    return check_pose(block, "T_BS", path)
+        raise CalibrationError("lacks the key 'T_BS'", where=where, cure="add the sensor's pose in the body")
+    return check_pose(block, "T_BS", where)
 
 
 def read_sensor_pair(left: Path, right: Path, *, imu: Path | None = None, body_is_flu: bool = False) -> StereoRig:
@@ -249,11 +248,13 @@ def read_sensor_pair(left: Path, right: Path, *, imu: Path | None = None, body_i
 
     ``body_is_flu`` says that the body's axes are x forward, y left, z up, so that it can serve as ``base_link``.
     """
-    T_body_left, T_body_right = read_sensor_pose(left), read_sensor_pose(right)
-    T_body_imu = read_sensor_pose(imu) if imu is not None else np.eye(4)
+    documents = [(read_yaml(path), path) for path in (left, right)]
+    T_body_left, T_body_right = (sensor_pose(*d) for d in documents)
+    T_body_imu = sensor_pose(read_yaml(imu), imu) if imu is not None else np.eye(4)
+    lenses = [_lens(document, str(path)) for document, path in documents]
     return StereoRig(
-        left=_lens(read_yaml(left), str(left)),
-        right=_lens(read_yaml(right), str(right)),
+        left=lenses[0],
+        right=lenses[1],
         T_right_left=se3.inverse(T_body_right) @ T_body_left,
         T_imu_left=se3.inverse(T_body_imu) @ T_body_left,
         T_body_left=T_body_left if body_is_flu else None,

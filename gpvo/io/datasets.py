@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from gpvo.cameras.kalibr import calibration_text, read_imu_noise, read_sensor_pair, read_sensor_pose, read_yaml
+from gpvo.cameras.kalibr import calibration_text, read_imu_noise, read_sensor_pair, read_yaml, sensor_pose
 from gpvo.cameras.readers import find_calibration, left_camera_offset, read_kitti_calib, read_stereo_yaml
 from gpvo.cameras.rig import StereoRig
 from gpvo.errors import CalibrationError, SourceError
@@ -154,8 +154,8 @@ def _marker_to_imu(mav: Path, folder: str) -> Array:
     T = []
     for sensor in (folder, "imu0"):
         file = mav / sensor / "sensor.yaml"
-        has_pose = file.is_file() and "T_BS" in read_yaml(file)
-        T.append(read_sensor_pose(file) if has_pose else np.eye(4))
+        document = read_yaml(file) if file.is_file() else {}
+        T.append(sensor_pose(document, file) if "T_BS" in document else np.eye(4))
     T_body_marker, T_body_imu = T
     return se3.inverse(T_body_marker) @ T_body_imu
 

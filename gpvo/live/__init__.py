@@ -27,7 +27,8 @@ class WireSettings:
 
     def transport(self) -> str | None:
         """The one of :data:`WIRES` that was chosen, None if none was. Raises GpvoError if several were."""
-        chosen = [name for name in WIRES if getattr(self, name)]
+        flags = zip(WIRES, (self.zenoh, self.dds, self.ros2, self.ros1))
+        chosen = [name for name, is_on in flags if is_on]
         if len(chosen) > 1:
             raise GpvoError(f"--{' and --'.join(chosen)} are mutually exclusive", cure="choose one")
         return chosen[0] if chosen else None

@@ -14,8 +14,8 @@ from gpvo.io.run import read_run, read_tracks
 from gpvo.sim.recorded import longest_flight_s
 from gpvo.types import Array, StereoCamera, StereoTracks, VoLog
 from gpvo.vo.config import KNOWN_DEPTH_PX
+from gpvo.vo.covariance import NoiseEstimator
 from gpvo.vo.motion import predict_uvd, refine, whitened
-from gpvo.vo.sigmas import NoiseEstimator
 
 _IMU_HZ = 200.0
 _MIN_POINTS = 12

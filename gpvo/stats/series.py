@@ -23,6 +23,14 @@ T = TypeVar("T")
 _LEVEL = 0.95  # of every interval
 
 
+def median(values: Array) -> float:
+    """Of (n,) numbers, NaN of none: ``np.median`` to the last bit, several times as fast for up to a thousand."""
+    ordered, half = np.sort(values), len(values) // 2
+    if not len(ordered) or np.isnan(ordered[-1]):
+        return math.nan
+    return float(ordered[half] if len(ordered) % 2 else (ordered[half - 1] + ordered[half]) / 2)
+
+
 def moving_sums(values: Array, m: int) -> Array:
     """(n - m + 1, ...) sums over every m consecutive rows of values (n, ...)."""
     total = np.concatenate([np.zeros((1, *values.shape[1:])), np.cumsum(values, axis=0)])

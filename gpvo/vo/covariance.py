@@ -3,7 +3,8 @@
 Full 6x6: ``(sum H_i^T W_i H_i)^-1`` with ``H_i = R [I, -[P_i]x]`` and ``W_i = (R U_i R^T + V_i)^-1``, U_i and V_i the
 covariances of the point in the current and in the reference frame (L. Matthies, S. Shafer 1987, eqs. 12-17; D. Ross,
 thesis, section 3.3), here in its equal form over (u, v, d). ``V_T = (sum W_i)^-1`` treats the rotation as known: its
-lateral variance is 2 to 10 times too small when the rotation is estimated too.
+lateral variance is 2 to 10 times too small when the rotation is estimated too. The sigmas of the points, where they are
+not given, are estimated from the residuals of motions.
 """
 
 from __future__ import annotations
@@ -15,16 +16,36 @@ import numpy as np
 
 from gpvo.geometry import se3
 from gpvo.geometry.covariance import symmetrise
+from gpvo.stats.series import median
 from gpvo.types import Array, StereoCamera
 from gpvo.vo.config import KNOWN_DEPTH_PX, VoConfig, pair_method
-from gpvo.vo.motion import Transfer, apply_whitener, residual_covariance, transfer, whitener
+from gpvo.vo.motion import (
+    Motion,
+    Transfer,
+    Whitened,
+    apply_whitener,
+    persistent_direction,
+    residual_covariance,
+    transfer,
+    whitener,
+)
 from gpvo.vo.points import (
+    PointNoise,
     no_farther_than,
     point_covariance,
     pointing_matching_pixel_covariance,
     triangulate,
     triangulation_pixel_covariance,
 )
+
+_MEMORY = 0.97  # of the running mean: about thirty frames
+_PARTS = 4, 2  # columns and rows of the image: finer ones see less of what neighbours share, coarser ones the same
+_CUT = 12.0  # squares of three degrees of freedom: against outliers
+_TEXTBOOK = 100.0 * np.array([[1.0, -1.0], [-1.0, 1.0]])  # prior of equal variance and covariance, worth 300 points
+# Of squares with one degree of freedom, cut off at four; of means of two, at 6.6 medians.
+_CUT_ALONG, _LEFT_ALONG = 4.0, 0.9195
+_CUT_ACROSS, _LEFT_ACROSS = 6.644, 0.99
+_USUAL_RATIO = 10.0  # prior deviation: an error of disparity three times the noise of an image coordinate
 
 
 @dataclass(frozen=True)
@@ -121,3 +142,169 @@ def covariances_by_method(
         else:
             out[method] = motion_covariance(T_prev_cur, uvd_prev, camera, S[method], moved=moved)
     return out
+
+
+@dataclass(frozen=True)
+class ResidualMoments:
+    """Two linear equations ``A [p^2, m^2] = sums`` for the variances of pointing and matching [px^2].
+
+    A residual's covariance is ``G S G^T + S`` with ``S = diag(p^2, p^2, m^2)``: the sums of squares of its image and of
+    its disparity part. ``freedom``: degrees of freedom of the residuals, after six went to the motion.
+    """
+
+    A: Array
+    sums: Array
+    freedom: float
+
+    @classmethod
+    def of(cls, residuals: Array, G: Array) -> ResidualMoments:
+        """Of the residuals (M, 3) of one motion, and their derivatives (3, 3, M) by the reference measurement."""
+        count, g2 = len(residuals), (G**2).sum(axis=2)
+        A = np.array([[g2[:2, :2].sum() + 2 * count, g2[:2, 2].sum()], [g2[2, :2].sum(), g2[2, 2] + count]])
+        freedom = max(3.0 * count - 6.0, 0.0)
+        squares = (residuals**2).sum(axis=0)
+        return cls(A * freedom / (3.0 * count), np.array([squares[0] + squares[1], squares[2]]), freedom)
+
+    def plus(self, other: ResidualMoments, memory: float = 1.0) -> ResidualMoments:
+        """Both together, this one fading."""
+        return ResidualMoments(
+            memory * self.A + other.A, memory * self.sums + other.sums, memory * self.freedom + other.freedom
+        )
+
+    @property
+    def sigmas(self) -> tuple[float, float]:
+        """(sigma_p, sigma_m) [px] that explain the residuals."""
+        p2, m2 = np.linalg.solve(self.A, self.sums)
+        # Few points tell the sum of both better than the share of each, which may come out negative.
+        least, most = _RATIO2
+        ratio2 = float(np.clip(max(p2, 0.0) / max(m2, 1e-9), least, most))
+        m_px = float(np.sqrt(max(self.sums.sum() / (self.A @ [ratio2, 1.0]).sum(), 1e-6)))
+        return m_px * ratio2**0.5, m_px
+
+
+_RATIO2 = 0.1**2, 2.0**2  # what the square of pointing over matching may be
+# To begin with 0.1 and 0.5 px, worth two points.
+_START = ResidualMoments(np.diag([8.0, 4.0]), np.array([8.0 * 0.1**2, 4.0 * 0.5**2]), 6.0)
+
+
+class SigmaEstimator:
+    """Fixed sigmas where given, else those of the residuals so far, fading."""
+
+    def __init__(self, sigma_p_px: float | None, sigma_m_px: float | None) -> None:
+        self._fixed = (sigma_p_px, sigma_m_px)
+        self._running = _START
+        self.design = DesignEffect()
+
+    def update(self, moments: ResidualMoments) -> None:
+        """Take in one motion's residuals."""
+        self._running = self._running.plus(moments, _MEMORY)
+
+    @property
+    def estimates(self) -> bool:
+        """Whether any sigma is not given."""
+        return None in self._fixed
+
+    @property
+    def values(self) -> tuple[float, float]:
+        """(sigma_p, sigma_m) [px] to use now.
+
+        Estimated ones are those of independent points that tell a motion as well as the points do: the residuals' own,
+        by the design effect. They are those of the second moment: the predictive of a motion is a Student-t with the
+        degrees of freedom of the residuals, whose variance is ``nu / (nu - 2)`` times as large.
+        """
+        nu = self._running.freedom
+        running = np.array(self._running.sigmas) * np.sqrt(nu / (nu - 2.0) * self.design.ratio)
+        p, m = (float(r) if f is None else f for f, r in zip(self._fixed, running, strict=True))
+        return p, m
+
+
+class DesignEffect:
+    """How many times the variance of a motion is that of one from independent points.
+
+    L. Kish, "Survey sampling", 1965; clusters of a regression: K.-Y. Liang, S. Zeger, 1986. Points near each other
+    err alike: on one surface, or one moving object. The motion's score, summed over each of :data:`_PARTS` parts of the
+    image, then scatters more than its information says.
+    """
+
+    def __init__(self) -> None:
+        self._scatter = self._expected = 1.0
+
+    def update(self, motion: Motion, white: Whitened, camera: StereoCamera) -> None:
+        """Take in a motion and its whitened residuals."""
+        z, A = white.z, white.A
+        share = motion.uvd_prev[:, :2] / [camera.width, camera.height]
+        column, row = np.clip((share * _PARTS).astype(np.int64), 0, np.array(_PARTS) - 1).T
+        part = row * _PARTS[0] + column == np.arange(_PARTS[0] * _PARTS[1])[:, None]
+        scores = part @ np.einsum("ikn,in->nk", A, z)
+        information = np.stack([np.einsum("ikn,iln->kl", B, B) for B in (A[..., p] for p in part)])
+        covariance = np.linalg.inv(information.sum(axis=0))
+        told = information @ covariance  # by each part; the motion takes the square of it off
+        variance = max(float((z**2).sum()) / max(z.size - 6.0, 1.0), 1e-12)
+        expected = float(np.trace(told, axis1=1, axis2=2).sum() - (told * told.transpose(0, 2, 1)).sum())
+        self._scatter = _MEMORY * self._scatter + float(((scores @ covariance) * scores).sum()) / variance
+        self._expected = _MEMORY * self._expected + expected
+
+    @property
+    def ratio(self) -> float:
+        """1 for independent points."""
+        return self._scatter / self._expected
+
+
+class NoiseEstimator:
+    """Running estimate of the form of the points' noise, :class:`gpvo.vo.points.PointNoise`.
+
+    ``shared`` solves two equations, those of u and d, for the variance of an image coordinate and the covariance of the
+    two. What persists shows as the flow that it predicts wrongly: more scatter along ``g``, the residual's derivative
+    by it, than across; it is 0 while it is not beyond chance, and drawn towards 0 by a prior.
+    """
+
+    def __init__(self) -> None:
+        self._normal: Array = np.zeros((2, 2))
+        self._moments: Array = np.zeros(2)
+        self._sums: Array = np.zeros(3)
+        self.value = PointNoise()
+
+    def update(self, motion: Motion, white: Whitened) -> None:
+        """Take in a motion and its whitened residuals."""
+        self.value = PointNoise(self._shared(motion, white), self.value.persistent)
+        self.value = PointNoise(self.value.shared, self._persistent(motion.residuals, white.moved.G))
+
+    def _shared(self, motion: Motion, white: Whitened) -> float:
+        """Least squares over the products ``r_u^2``, ``r_d^2`` and ``r_u r_d`` of all points."""
+        G, noise, variance = white.moved.G, motion.noise, motion.scale_px**2
+        C = white.C
+        alone = residual_covariance(G, PointNoise(0.0).S, PointNoise(0.0).S, noise.persistent)
+        z2 = (white.z**2).sum(0)
+        r = motion.residuals.T * np.sqrt(np.minimum(1.0 / variance, _CUT / np.maximum(z2, 1e-9 * variance)))
+        normal, moments = np.zeros((2, 2)), np.zeros(2)
+        for i, j in ((0, 0), (2, 2), (0, 2)):
+            both = G[i, 0] * G[j, 2] + G[i, 2] * G[j, 0] + float(i != j)
+            weight = 1.0 / (C[i, i] * C[j, j] + C[i, j] ** 2)
+            X = np.stack([alone[i, j], both])
+            normal += (X * weight) @ X.T
+            moments += (X * weight) @ (r[i] * r[j])
+        self._normal, self._moments = _MEMORY * self._normal + normal, _MEMORY * self._moments + moments
+        variance, covariance = np.linalg.solve(self._normal + _TEXTBOOK, self._moments)
+        return float(np.clip(covariance / max(variance, 1e-9), 0.0, 1.0))
+
+    def _persistent(self, residuals: Array, G: Array) -> float:
+        """Variance over that of an image coordinate, shrunk by its own uncertainty."""
+        ratio = self.value.persistent
+        W = whitener(residual_covariance(G, self.value.S, self.value.S))
+        z, g = apply_whitener(W, residuals.T), apply_whitener(W, persistent_direction(G))
+        g2 = (g * g).sum(0)
+        along2 = (g * z).sum(0) ** 2 / np.maximum(g2, 1e-12)
+        across2 = 0.5 * ((z * z).sum(0) - along2)
+        # Squares are cut off against outliers; the divisors are what a Gaussian has left of its variance.
+        limit = _CUT_ACROSS * median(across2)
+        sigma2 = max(float(np.minimum(across2, limit).mean()) / _LEFT_ACROSS, 1e-6)
+        expected = 1.0 + ratio * g2
+        along2 = np.minimum(along2 / sigma2, _CUT_ALONG * expected) / _LEFT_ALONG
+        weight = g2 / expected**2
+        now = np.array([weight @ (along2 - 1.0), weight @ g2, 3.0 * weight @ weight])
+        self._sums = _MEMORY * self._sums + now
+        excess, information, variance = self._sums
+        if excess <= 2.0 * variance**0.5:
+            return 0.0
+        # Between images of nearly the same place hardly anything tells: then the prior does.
+        return float((excess - 4.0 * variance / excess) * information / (information**2 + variance / _USUAL_RATIO**2))

@@ -1,15 +1,15 @@
 """The fast front end: corners at half resolution, followed and matched left to right by Lucas-Kanade.
 
 Whole-pixel corners dominate the error of a descriptor pipeline; here a corner only says which patch to follow, and
-every position that enters the motion is the sub-pixel result of aligning that patch. Where too little is found near
-the guess, both images are matched afresh by features of every scale (P. Alcantarilla, J. Nuevo, A. Bartoli, "Fast
-explicit diffusion for accelerated features in nonlinear scale spaces", 2013).
+every position that enters the motion is the sub-pixel result of aligning that patch (:mod:`gpvo.vo.patches`). Where
+too little is found near the guess, both images are matched afresh by features of every scale (P. Alcantarilla, J.
+Nuevo, A. Bartoli, "Fast explicit diffusion for accelerated features in nonlinear scale spaces", 2013).
 """
 
 from __future__ import annotations
 
 from concurrent.futures import Future, ThreadPoolExecutor
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 
 import numpy as np
 from numpy.typing import NDArray
@@ -18,12 +18,39 @@ from gpvo.types import Array, StereoCamera, StereoFrame, TrackFrame
 from gpvo.vo import opencv
 from gpvo.vo.config import KNOWN_DEPTH_PX, VoConfig
 from gpvo.vo.frontend import EMPTY, Matches, Observation, RightSearch
-from gpvo.vo.motion import predict_uvd
+from gpvo.vo.motion import transfer
 from gpvo.vo.opencv import Image, Light, Points, image_stats, in_light_of
+from gpvo.vo.patches import Patches, align, cut
 from gpvo.vo.rig_error import RigError
 from gpvo.vo.rivals import cells
 
 _FEATURES = 2000  # of an image that is matched afresh
+_MOST_DEFORMED = 0.5  # of a patch, over its size: beyond, it is no longer the same picture
+
+
+@dataclass(frozen=True)
+class _Seen:
+    """Points seen in both images.
+
+    ``left_uv`` (N, 2): their places in the left one, the middles of their patches; ``uvd`` (N, 3): their measurements;
+    ``slope`` (N, 2): by how much the disparity of their surface grows per pixel of u and of v; ``patches`` of the left
+    image around them.
+    """
+
+    left_uv: Points
+    uvd: Array
+    slope: Array
+    patches: Patches
+
+    def __len__(self) -> int:
+        return len(self.uvd)
+
+    def __getitem__(self, which: NDArray[np.bool_] | slice) -> _Seen:
+        return _Seen(*(getattr(self, f.name)[which] for f in fields(self)))
+
+    def __add__(self, other: _Seen) -> _Seen:
+        both = ((getattr(self, f.name), getattr(other, f.name)) for f in fields(self))
+        return _Seen(*(np.concatenate(pair) for pair in both))
 
 
 @dataclass
@@ -37,27 +64,31 @@ class _View:
     light_left: Light
     right_as_left: Image  # the right image in the left's light
     survey: Future[tuple[Points, NDArray[np.float32]]]  # corners (N, 2) of the half image, disparity of a quarter one
-    uvd: Array  # (N, 3) points usable as reference
-    left_uv: Points  # (N, 2) their positions in the left image, the templates' centres
+    seen: _Seen  # usable as reference
     strong: int = 0  # the points from here on are spare ones
     features: tuple[Points, NDArray[np.uint8]] | None = None  # those of the left image to find again, once asked for
 
 
 @dataclass(frozen=True)
 class _New:
-    """New corners of the current frame: how many were found, and those (N, 2) with their measurement (N, 3).
+    """New corners of the current frame: how many were found, and those also seen in the right image.
 
     ``strong``: how many of them are the image's best; after them come spare ones.
     """
 
     detected: int
-    left_uv: Points
-    uvd: Array
-    strong: int = 0
+    seen: _Seen
+    strong: int
 
 
-_NO_POINTS: Points = np.empty((0, 2), np.float32)
-_NONE_NEW = _New(0, _NO_POINTS, np.empty((0, 3)))
+@dataclass(frozen=True)
+class _Found:
+    """What the search in the right image came to: for each point sought ``seen``, whether it can be believed, ``good``
+    (N,), and by how much the right row lies below the left one, ``row_error`` (N,), NaN where nothing was found."""
+
+    seen: _Seen
+    good: NDArray[np.bool_]
+    row_error: Array
 
 
 def _equal(half_a: Image, half_b: Image, a: Image, b: Image) -> bool:
@@ -79,9 +110,9 @@ class KltFrontend:
         self._half_mask = opencv.as_mask(half)
         self._reference: _View | None = None
         self._current: _View | None = None
-        self._new = _NONE_NEW
-        self._matched_left = _NO_POINTS
-        self._matched_uvd: Array = np.empty((0, 3))
+        no_patches = np.empty((0, 3, config.klt_window_px**2), np.float32)
+        self._nothing = _Seen(np.empty((0, 2), np.float32), np.empty((0, 3)), np.empty((0, 2)), no_patches)
+        self._new, self._matched = _New(0, self._nothing, 0), self._nothing
         self._pool = ThreadPoolExecutor(1)
 
     def observe(self, frame: StereoFrame | TrackFrame) -> Observation:
@@ -93,9 +124,7 @@ class KltFrontend:
         right = in_light_of(frame.right, light_right, light_left)
         # New corners and rough depth are wanted only after the motion; they are found beside it.
         survey = self._pool.submit(self._survey, half_left, half_right)
-        self._current = _View(
-            frame.left, frame.right, half_left, half_right, light_left, right, survey, np.empty((0, 3)), _NO_POINTS
-        )
+        self._current = _View(frame.left, frame.right, half_left, half_right, light_left, right, survey, self._nothing)
         same_left = before is not None and _equal(before.half_left, half_left, before.left, frame.left)
         same_right = before is not None and _equal(before.half_right, half_right, before.right, frame.right)
         return Observation(
@@ -110,52 +139,80 @@ class KltFrontend:
     def match(self, T_prev_cur_guess: Array, *, from_scratch: bool = False) -> Matches:
         """Follow the reference's points into the left image, then find each in the right one."""
         reference, current = self._reference, self._current
-        if reference is None or current is None or len(reference.uvd) == 0:
+        if reference is None or current is None or len(reference.seen) == 0:
             return EMPTY
-        config = self._config
         if from_scratch:
             return self._find_again(reference, current)
-        uvd, left_uv, guess = reference.uvd, reference.left_uv, self._predict(T_prev_cur_guess)
-        left = in_light_of(current.left, current.light_left, reference.light_left)
-        cur_left, followed, found = opencv.track(
-            reference.left, left, left_uv, guess[:, :2], config.klt_window_px, config.klt_levels
+        followed, found, uv, disparity, slope = self._follow(reference, current, T_prev_cur_guess)
+        before, n = reference.seen[found], len(uv)
+        both = self._with_new_corners(current, uv, disparity, slope)
+        good = both.good[:n]
+        self._matched = both.seen[:n][good]
+        return Matches(
+            before.uvd[good],
+            self._matched.uvd,
+            both.row_error[:n][good],
+            int(followed[: reference.strong].sum()),
+            spare=(np.flatnonzero(found) >= reference.strong)[good],
+            right=self._right_search(both, uv[:, 1] - before.left_uv[:, 1]),
+            sought_uvd=reference.seen.uvd,
         )
-        n_followed = int(followed[: reference.strong].sum())
-        uvd, from_left, cur_left, disparity = uvd[found], left_uv[found], cur_left[found], guess[found, 2]
-        spare = np.flatnonzero(found) >= reference.strong
-        both_uvd, both_good, row_error = self._with_new_corners(current, cur_left, disparity)
-        n = len(cur_left)
-        uvd_cur, good = both_uvd[:n], both_good[:n]
-        self._matched_left, self._matched_uvd = cur_left[good], uvd_cur[good]
-        right = self._right_search(both_uvd, both_good, row_error, cur_left[:, 1] - from_left[:, 1])
-        row_error = row_error[:n][good]
-        return Matches(uvd[good], uvd_cur[good], row_error, n_followed, spare[good], right, reference.uvd)
+
+    def _follow(
+        self, reference: _View, current: _View, T_prev_cur: Array
+    ) -> tuple[NDArray[np.bool_], NDArray[np.bool_], Points, Array, Array]:
+        """The reference's points found in the left image near where the motion puts them.
+
+        Which of them (N,) something was found for, and which (N,) look like what was sought; of these M, their places
+        (M, 2), and the disparity (M,) and its slope (M, 2) that the motion lets expect.
+        """
+        config, seen = self._config, reference.seen
+        uvd, A, h, slope = self._expected(seen, T_prev_cur)
+        left = in_light_of(current.left, current.light_left, reference.light_left)
+        uv, followed = opencv.track(
+            reference.left, left, seen.left_uv, uvd[:, :2], config.klt_window_px, config.klt_levels
+        )
+        found = followed.copy()
+        near = align(seen.patches[found], left, uv[found], A[found], h[found])
+        found[found] = near.alike
+        return followed, found, near.uv[near.alike], uvd[found, 2], slope[found]
 
     def promote(self, inliers: NDArray[np.bool_] | None, at_least: int = 0) -> tuple[int, int]:
         """Carry on the inliers, and add new corners where there are none."""
         current = self._current
         assert current is not None
         if inliers is None:
-            self._matched_left, self._matched_uvd = _NO_POINTS, np.empty((0, 3))
-            self._with_new_corners(current, _NO_POINTS, np.empty(0))
+            self._matched = self._nothing
+            self._with_new_corners(current, self._nothing.left_uv, np.empty(0), self._nothing.slope)
             inliers = np.zeros(0, bool)
-        uv, new = self._matched_left[inliers], self._new
-        current.left_uv = np.concatenate([uv, new.left_uv])
-        current.uvd = np.concatenate([self._matched_uvd[inliers], new.uvd])
-        current.strong = len(uv) + new.strong
+        kept, new = self._matched[inliers], self._new
+        current.seen = kept + new.seen
+        current.strong = len(kept) + new.strong
         if current.strong >= at_least:
             self._reference = current
-        self._matched_left, self._matched_uvd, self._new = _NO_POINTS, np.empty((0, 3)), _NONE_NEW
-        return len(uv) + new.detected, current.strong
+        self._matched, self._new = self._nothing, _New(0, self._nothing, 0)
+        return len(kept) + new.detected, current.strong
 
-    def _predict(self, T_prev_cur: Array) -> Array:
-        """(N, 3) where the guess puts the reference's points; the old place for those it puts out of sight."""
-        assert self._reference is not None
-        uvd = self._reference.uvd
-        (u, v, d), in_front = predict_uvd(T_prev_cur, uvd, self._camera)
+    def _expected(self, seen: _Seen, T_prev_cur: Array) -> tuple[Array, Array, Array, Array]:
+        """Where a motion puts the points (N, 3), how it deforms their patches, (N, 2, 2) and (N, 2) of :func:`align`,
+        and the slope of their disparity there (N, 2); as they were for those it puts out of sight."""
+        moved = transfer(T_prev_cur, seen.uvd, self._camera)
+        (u, v, d), G = moved.uvd, moved.G.transpose(2, 0, 1)
         w, h = self._camera.width, self._camera.height
-        visible = in_front & (u >= 0) & (u < w) & (v >= 0) & (v < h) & (d < w)
-        return np.where(visible[:, None], np.column_stack([u, v, d]), uvd)
+        A = G[:, :2, :2] + G[:, :2, 2:] * seen.slope[:, None]
+        slope = G[:, 2, :2] + G[:, 2, 2:] * seen.slope
+        visible = moved.in_front & (u >= 0) & (u < w) & (v >= 0) & (v < h) & (d < w)
+        visible &= np.abs(A - np.eye(2)).max(axis=(1, 2), initial=0.0) < _MOST_DEFORMED
+        # Depth over that of before is linear in the place and in the disparity, and so over a plane.
+        R, t = T_prev_cur[:3, :3].T, -T_prev_cur[:3, :3].T @ T_prev_cur[:3, 3]
+        c = self._camera
+        by_u, by_v, by_d = R[2, 0] / c.fx_px, R[2, 1] / c.fy_px, t[2] / (c.fx_px * c.baseline_m)
+        depth = R[2, 2] + (seen.uvd - (c.cx_px, c.cy_px, 0.0)) @ (by_u, by_v, by_d)
+        h = np.where(visible, 1.0 / np.where(visible, depth, 1.0), 0.0)[:, None] * ((by_u, by_v) + by_d * seen.slope)
+        A = np.where(visible[:, None, None], A, np.eye(2))
+        there = np.linalg.solve(A.transpose(0, 2, 1), slope[:, :, None])[:, :, 0]
+        slope = np.where(visible[:, None], there, seen.slope)
+        return np.where(visible[:, None], np.column_stack([u, v, d]), seen.uvd), A, h, slope
 
     def _survey(self, half_left: Image, half_right: Image) -> tuple[Points, NDArray[np.float32]]:
         """Corners of the half-size left image, strongest first, and disparity at a quarter of the size."""
@@ -200,31 +257,44 @@ class KltFrontend:
         chosen, first = np.unique(cell, return_index=True)
         return uv[first[~np.isin(chosen, taken)]]
 
-    def _with_new_corners(self, view: _View, uv: Points, disparity: Array) -> tuple[Array, NDArray[np.bool_], Array]:
+    def _with_new_corners(self, view: _View, uv: Points, disparity: Array, slope: Array) -> _Found:
         """One search in the right image for both known points of the left one and the new corners between them: as
         :meth:`_find_right`, the known points first."""
         new_uv, new_disparity, detected = self._new_corners(view, uv)
-        found = self._find_right(view, np.concatenate([uv, new_uv]), np.concatenate([disparity, new_disparity]))
-        new_uvd, good = found[0][len(uv) :], found[1][len(uv) :]
-        self._new = _New(detected, new_uv[good], new_uvd[good], int(good[:detected].sum()))
+        found = self._find_right(
+            view,
+            np.concatenate([uv, new_uv]),
+            np.concatenate([disparity, new_disparity]),
+            np.concatenate([slope, np.zeros((len(new_uv), 2))]),
+        )
+        new, good = found.seen[len(uv) :], found.good[len(uv) :]
+        self._new = _New(detected, new[good], int(good[:detected].sum()))
         return found
 
-    def _find_right(self, view: _View, uv_left: Points, disparity: Array) -> tuple[Array, NDArray[np.bool_], Array]:
-        """(N, 3) measurements of left points, from a guessed disparity; which of them can be believed; and by how much
-        the right row lies below the left one, NaN where nothing was found."""
+    def _find_right(self, view: _View, uv_left: Points, disparity: Array, slope: Array) -> _Found:
+        """Points (N, 2) of the left image sought in the right one, from a guessed disparity (N,) and slope (N, 2)."""
         config = self._config
         guess = np.column_stack([uv_left[:, 0] - disparity, uv_left[:, 1]])
-        uv_right, _, found = opencv.track(view.left, view.right_as_left, uv_left, guess, config.klt_window_px, 2)
+        window_px = config.klt_window_px
+        uv_right, found = opencv.track(view.left, view.right_as_left, uv_left, guess, window_px, 2)
+        A = np.tile(np.eye(2), (len(uv_left), 1, 1))
+        A[:, 0] -= slope
+        patches = cut(view.left, uv_left, window_px)
+        near = align(patches, view.right_as_left, uv_right, A)
+        uv_right = np.where(near.alike[:, None], near.uv, uv_right)
         d = uv_left[:, 0].astype(np.float64) - uv_right[:, 0]
         row_error = uv_right[:, 1].astype(np.float64) - uv_left[:, 1]
         uvd = np.column_stack([uv_left[:, 0], uv_left[:, 1] + 0.5 * row_error, d])
         limit = config.max_disparity_share * self._camera.width
+        found &= near.alike
         good = self._rig_error.allows(uvd, row_error, config.min_disparity_px, limit, config.max_row_error_px)
-        return uvd, found & good, np.where(found, row_error, np.nan)
+        seen = _Seen(uv_left, uvd, (1.0, 0.0) - near.A[:, 0], patches)
+        return _Found(seen, found & good, np.where(found, row_error, np.nan))
 
-    def _right_search(self, uvd: Array, good: NDArray[np.bool_], row_error: Array, row_motion: Array) -> RightSearch:
+    def _right_search(self, both: _Found, row_motion: Array) -> RightSearch:
         """What the search in the right image came to; the first points were followed and have moved down so far."""
-        n, measured = len(row_motion), row_error
+        uvd, row_error, n = both.seen.uvd, both.row_error, len(row_motion)
+        measured = row_error
         d_expected, row_expected = self._rig_error.errors(uvd)
         disparity, row_error = uvd[:, 2] - d_expected, row_error - row_expected
         # A pair that is off by the same rows everywhere is still a pair: its rows are counted from there.
@@ -237,7 +307,7 @@ class KltFrontend:
         seen = np.abs(row_error[:n]) < self._config.klt_window_px
         return RightSearch(
             len(uvd) - int(far.sum()),
-            int((good & ~off_row & ~far & ~behind).sum()),
+            int((both.good & ~off_row & ~far & ~behind).sum()),
             int(behind.sum()),
             int(off_row.sum()),
             measured[:n][seen],  # an image that is late would else be taken for a rig that is off
@@ -248,14 +318,16 @@ class KltFrontend:
         """Match both left images afresh, without any guess and over any change of scale."""
         (from_uv, from_bits), (to_uv, to_bits) = self._features(reference), self._features(current)
         pairs = opencv.match_mutual(from_bits, to_bits)
-        before, good_before, _ = self._find_right(reference, *self._rough(reference, from_uv[pairs[:, 0]]))
-        uv, n = to_uv[pairs[:, 1]], len(pairs)
-        uvd, found, row_error = self._with_new_corners(current, *self._rough(current, uv))
-        good = good_before & found[:n]
-        self._matched_left, self._matched_uvd = uv[good], uvd[:n][good]
+        uv, disparity = self._rough(reference, from_uv[pairs[:, 0]])
+        before = self._find_right(reference, uv, disparity, np.zeros((len(uv), 2)))
+        uv, disparity = self._rough(current, to_uv[pairs[:, 1]])
+        now = self._with_new_corners(current, uv, disparity, np.zeros((len(uv), 2)))
+        n = len(uv)
+        good = before.good & now.good[:n]
+        self._matched = now.seen[:n][good]
         # Wrong pairs are no second motion: nothing is said of points sought in vain, nor of how rows move.
-        right = self._right_search(uvd, found, row_error, np.empty(0))
-        return Matches(before[good], uvd[:n][good], row_error[:n][good], n, right=right)
+        right = self._right_search(now, np.empty(0))
+        return Matches(before.seen.uvd[good], self._matched.uvd, now.row_error[:n][good], n, right=right)
 
     def _features(self, view: _View) -> tuple[Points, NDArray[np.uint8]]:
         if view.features is None:

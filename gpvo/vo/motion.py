@@ -14,6 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from gpvo.geometry import se3
+from gpvo.stats.series import median
 from gpvo.types import Array, StereoCamera
 from gpvo.vo.config import TELLING_PX
 from gpvo.vo.points import PointNoise
@@ -98,11 +99,9 @@ def residual_covariance(G: Array, S_prev: Array, S_cur: Array, persistent: float
     """
     GS = np.einsum("ikn,kl->iln", G, S_prev)
     C, g = np.empty_like(G), persistent_direction(G)
-    for i in range(3):
-        for j in range(i, 3):
-            C[i, j] = C[j, i] = (
-                GS[i, 0] * G[j, 0] + GS[i, 1] * G[j, 1] + GS[i, 2] * G[j, 2] + S_cur[i, j] + persistent * g[i] * g[j]
-            )
+    for i in range(3):  # a row at a time: with so few points, what costs time is the number of steps
+        row = GS[i, 0] * G[i:, 0] + GS[i, 1] * G[i:, 1] + GS[i, 2] * G[i:, 2]
+        C[i, i:] = C[i:, i] = row + S_cur[i, i:, None] + persistent * g[i] * g[i:]
     return C
 
 
@@ -166,11 +165,12 @@ class Motion:
 class Whitened:
     """The residuals of a motion, whitened to unit covariance for unit pixel noise.
 
-    ``moved``: the transfer of its smoothed points; ``W`` (3, 3, M) the whitener; ``z`` (3, M) residuals; ``A``
-    (3, 6, M) their derivatives by a right perturbation of the motion.
+    ``moved``: the transfer of its smoothed points; ``C`` (3, 3, M) the covariance of its residuals, ``W`` its whitener;
+    ``z`` (3, M) residuals; ``A`` (3, 6, M) their derivatives by a right perturbation of the motion.
     """
 
     moved: Transfer
+    C: Array
     W: Array
     z: Array
     A: Array
@@ -179,8 +179,9 @@ class Whitened:
 def whitened(motion: Motion, camera: StereoCamera) -> Whitened:
     """The residuals of a motion, whitened as when it was estimated."""
     moved = transfer(motion.T_prev_cur, motion.uvd_prev, camera)
-    W = whitener(residual_covariance(moved.G, motion.noise.S, motion.noise.S, motion.noise.persistent))
-    return Whitened(moved, W, apply_whitener(W, motion.residuals.T), apply_whitener(W, moved.H))
+    C = residual_covariance(moved.G, motion.noise.S, motion.noise.S, motion.noise.persistent)
+    W = whitener(C)
+    return Whitened(moved, C, W, apply_whitener(W, motion.residuals.T), apply_whitener(W, moved.H))
 
 
 # Iterations in which the inliers may change; then they stand, or a point on the fence would keep the estimate moving.
@@ -236,7 +237,8 @@ def refine(
         if keep.sum() < 3:
             return None
         A = apply_whitener(W, moved.H)
-        information, step = _solve_step(A[..., keep], z[:, keep], weight[keep])
+        kept = np.flatnonzero(keep)
+        information, step = _solve_step(A.take(kept, axis=2), z.take(kept, axis=1), weight[kept])
         if step is None:
             return None
         T = T @ se3.exp(step)
@@ -293,6 +295,6 @@ def _robust_weights(m2: Array, close: NDArray[np.bool_]) -> tuple[NDArray[np.boo
     # Floor: below a fiftieth of a pixel the residual is rounding, and everything would look like an outlier.
     # Six of the residuals' degrees of freedom went to the motion.
     freedom = max(1.0 - 2.0 / max(int(close.sum()), 1), 1 / 3)
-    scale2 = max(float(np.median(m2[close])) / CHI2_3_MEDIAN / freedom if close.any() else 1.0, 0.02**2)
+    scale2 = max(median(m2[close]) / CHI2_3_MEDIAN / freedom if close.any() else 1.0, 0.02**2)
     ratio = m2 / scale2
     return close & (ratio < CHI2_3_999), float(np.sqrt(scale2)), huber(ratio)

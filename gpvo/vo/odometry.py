@@ -13,7 +13,7 @@ from gpvo.geometry.covariance import lost_covariance
 from gpvo.types import Array, ImuLog, ImuMoments, Status, StereoCamera, StereoFrame, TrackFrame, VoRecord
 from gpvo.vo import opencv
 from gpvo.vo.config import KNOWN_DEPTH_PX, TELLING_PX, VoConfig
-from gpvo.vo.covariance import covariances_by_method
+from gpvo.vo.covariance import NoiseEstimator, ResidualMoments, SigmaEstimator, covariances_by_method
 from gpvo.vo.frontend import EMPTY, DescriptorFrontend, Followed, Frontend, Matches, TrackFrontend
 from gpvo.vo.klt import KltFrontend
 from gpvo.vo.motion import Motion, refine, whitened
@@ -30,7 +30,6 @@ from gpvo.vo.quality import (
 )
 from gpvo.vo.rig_error import RigError, RigState
 from gpvo.vo.rivals import Choice, areas, choose, unexplained, untangled
-from gpvo.vo.sigmas import NoiseEstimator, ResidualMoments, SigmaEstimator
 from gpvo.vo.state import State, Stopwatch, own_frame
 from gpvo.vo.window import Window
 

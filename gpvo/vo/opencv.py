@@ -25,7 +25,6 @@ _IMMERKAER = np.array([[1, -2, 1], [-2, 4, -2], [1, -2, 1]], np.float32)
 _SAME_LIGHT = 1.06
 _WOVEN = 1.01  # times; 1 in nothing but noise
 _NO_PICTURE = 2.0  # grey values of contrast
-_ALIKE = 0.9  # difference of two patches of one thing over what varies within; those of noise have 1.1 to 1.4
 
 
 def as_mask(usable: NDArray[np.bool_] | None) -> Image | None:
@@ -47,16 +46,14 @@ def corners(image: Image, count: int, quality: float, min_distance_px: float, ma
 
 def track(
     image_from: Image, image_to: Image, points: Points, guess: Points, window_px: int, levels: int
-) -> tuple[Points, NDArray[np.bool_], NDArray[np.bool_]]:
-    """Pyramidal Lucas-Kanade from ``points`` (N, 2), starting at ``guess`` (N, 2): positions, success, and which of
-    those found look like what was sought.
+) -> tuple[Points, NDArray[np.bool_]]:
+    """Pyramidal Lucas-Kanade from ``points`` (N, 2), starting at ``guess`` (N, 2): positions, and success.
 
-    In noise it succeeds wherever it starts, and would confirm any guess. But two patches of noise differ by more than
-    varies within each: at a correlation of r, the variance of the difference is ``2 (1 - r)`` times that.
+    In noise it succeeds wherever it starts, and would confirm any guess.
     """
     if len(points) == 0:
-        return np.empty((0, 2), np.float32), np.empty(0, bool), np.empty(0, bool)
-    moved, found, misfit = cv2.calcOpticalFlowPyrLK(
+        return np.empty((0, 2), np.float32), np.empty(0, bool)
+    moved, found, _ = cv2.calcOpticalFlowPyrLK(
         image_from,
         image_to,
         np.ascontiguousarray(points, np.float32)[:, None],
@@ -64,23 +61,13 @@ def track(
         winSize=(window_px, window_px),
         maxLevel=levels - 1,
         flags=cv2.OPTFLOW_USE_INITIAL_FLOW,
-        criteria=(cv2.TERM_CRITERIA_COUNT | cv2.TERM_CRITERIA_EPS, 10, 0.02),
+        criteria=(cv2.TERM_CRITERIA_COUNT | cv2.TERM_CRITERIA_EPS, 10, 0.1),
         minEigThreshold=1e-4,
     )
     moved = moved[:, 0]
     h, w = image_to.shape
     inside = (moved[:, 0] >= 0) & (moved[:, 1] >= 0) & (moved[:, 0] <= w - 1) & (moved[:, 1] <= h - 1)
-    found = (found[:, 0] > 0) & inside
-    return moved, found, found & (misfit[:, 0] < _ALIKE * _variation(image_from, points, window_px))
-
-
-def _variation(image: Image, points: Points, window_px: int) -> NDArray[np.float32]:
-    """(N,) mean absolute deviation of the patch around each point (N, 2) from its own mean [grey values]."""
-    offset = np.arange(-(window_px // 2), window_px // 2 + 1, 2)  # every second pixel tells enough
-    place = np.round(points).astype(np.intp)[:, :, None] + offset
-    x, y = (np.clip(place[:, k], 0, image.shape[1 - k] - 1) for k in (0, 1))
-    patch = image[y[:, :, None], x[:, None, :]].reshape(len(points), -1).astype(np.float32)
-    return np.asarray(np.abs(patch - patch.mean(axis=1, keepdims=True)).mean(axis=1))
+    return moved, (found[:, 0] > 0) & inside
 
 
 def coarse_disparity(left: Image, right: Image, max_disparity_px: int) -> NDArray[np.float32]:

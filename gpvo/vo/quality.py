@@ -14,12 +14,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from gpvo.geometry import se3
+from gpvo.stats.series import median
 from gpvo.types import Array, Status, StereoCamera
 from gpvo.vo.config import KNOWN_DEPTH_PX, TELLING_PX, VoConfig
+from gpvo.vo.covariance import ResidualMoments
 from gpvo.vo.frontend import Matches, Observation, RightSearch
 from gpvo.vo.motion import Motion, predict_uvd, within
 from gpvo.vo.opencv import ImageStats
-from gpvo.vo.sigmas import ResidualMoments
 
 _ENOUGH_FOR_SIGMAS = 8  # points
 _MEMORY = 0.8  # of the running sums: about five frames
@@ -137,7 +138,7 @@ def median_parallax_px(matches: Matches, inliers: NDArray[np.bool_]) -> float:
     near = inliers & (matches.uvd_prev[:, 2] > KNOWN_DEPTH_PX)
     chosen = near if near.any() else inliers
     off = matches.uvd_cur[chosen, :2] - matches.uvd_prev[chosen, :2]
-    return float(np.median(np.hypot(off[:, 0], off[:, 1])))
+    return median(np.hypot(off[:, 0], off[:, 1]))
 
 
 class PairWatch:

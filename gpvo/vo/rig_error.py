@@ -31,6 +31,7 @@ from itertools import product
 import numpy as np
 from numpy.typing import NDArray
 
+from gpvo.stats.series import median
 from gpvo.types import Array, StereoCamera
 from gpvo.vo.motion import Motion, Whitened, apply_whitener, persistent_direction
 
@@ -212,7 +213,7 @@ class RigError:
     def _learn_rows(self, rows: Array, row_error: Array) -> None:
         """``rows`` (15, M): derivatives of the row errors by dy. Far points tell as much as near ones."""
         off = row_error - self.state.mean[_DY] @ rows
-        sigma = max(1.4826 * float(np.median(np.abs(off))), 0.05)
+        sigma = max(1.4826 * median(np.abs(off)), 0.05)
         weighted = rows * np.minimum(1.0, 2.5 * sigma / np.maximum(np.abs(off), 1e-9)) / sigma**2
         self._blocks[1].add(weighted @ rows.T, weighted @ row_error)
 

@@ -18,6 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from gpvo.geometry import se3
+from gpvo.stats.series import median
 from gpvo.types import Array, StereoCamera
 from gpvo.vo.frontend import Matches, keys
 from gpvo.vo.motion import CHI2_3_999, CHI2_3_MEDIAN, Motion, huber, transfer
@@ -133,7 +134,7 @@ def adjust(
         r[..., 2] -= kept * seen
         if robust and 1 < iteration <= _CHOOSING:
             m2 = ((r @ whiten.T) ** 2).sum(axis=2)
-            ratio = m2 * CHI2_3_MEDIAN / max(float(np.median(m2[seen])), 0.02**2)
+            ratio = m2 * CHI2_3_MEDIAN / max(median(m2[seen]), 0.02**2)
             weight = np.where(seen & (ratio < CHI2_3_999), huber(ratio), 0.0)
         weight[1:] *= in_front
         weight[0] = np.maximum(weight[0], 1e-6)  # no place is without any hold

@@ -8,13 +8,17 @@ import shutil
 import subprocess
 import sys
 from contextlib import suppress
+from dataclasses import dataclass
 from pathlib import Path
+from typing import Annotated
 
 import pytest
 import typer.main
 from gpvo.cli import app
+from gpvo.cli.common import with_common_options
 from gpvo.io.run import write_run
 from synthetic_runs import make_run
+from typer.testing import CliRunner
 
 ROOT = Path(__file__).parents[2]
 UNSEEN, MODEL = str(ROOT / "data" / "unseen"), str(ROOT / "models" / "tunnel.gpvo")
@@ -79,6 +83,39 @@ def test_what_a_file_gets_wrong_is_one_line(tmp_path: Path, text: str, told: str
     assert done.returncode == 2
     assert done.stderr.count("\n") == 1
     assert told in done.stderr
+
+
+def test_a_file_of_options_that_is_missing_is_refused_as_any_other_file(tmp_path: Path):
+    done = call("evaluate", UNSEEN, "--config", "o.toml", folder=tmp_path)
+    assert done.stderr == "gpvo: o.toml: cannot be read: No such file or directory\n"
+
+
+@dataclass(frozen=True)
+class Wire:
+    fast: Annotated[bool, "No waiting."] = False
+
+
+@dataclass(frozen=True)
+class Asked:
+    model: Annotated[Path, "--model", "A file."]
+    wire: Wire = Wire()
+    depth: Annotated[int, "At least 2.", {"min": 2}] = 10
+    inner: int = 7  # nobody's option
+
+
+def test_options_are_declared_by_type_and_help_also_in_settings_of_settings():
+    seen: list[object] = []
+
+    def command(runs: Annotated[list[Path], "Folders."], asked: Asked, out: Annotated[Path, "A file."]) -> None:
+        seen.append((runs, asked, out))
+
+    alone = typer.Typer()
+    alone.command()(with_common_options(command))
+    given = ["a", "b", "--model", "m", "-o", "x"]
+    assert CliRunner().invoke(alone, [*given, "--fast", "--depth", "3"]).exit_code == 0
+    assert seen == [([Path("a"), Path("b")], Asked(Path("m"), Wire(fast=True), 3), Path("x"))]
+    for wrong in (["a", "-o", "x"], ["a", "--model", "m"], [*given, "--depth", "1"], [*given, "--no-fast"]):
+        assert CliRunner().invoke(alone, wrong).exit_code == 2, wrong
 
 
 @pytest.mark.parametrize(

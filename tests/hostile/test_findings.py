@@ -33,7 +33,7 @@ FINDINGS = {
         " a_chunk_that_claims_gigabytes_is_not_made_room_for,"
         " a_sequence_of_such_images_is_refused_by_its_calibration, an_array_that_nobody_needs_is_not_unpacked,"
         " an_array_that_is_needed_is_not_unpacked_beyond_all_tracks, a_table_of_run_lengths_is_refused,"
-        " a_file_without_an_end_is_left_at_its_bound",
+        " a_pipe_without_an_end_is_left_at_its_bound",
     ),
     "5 faults of the IMU": (
         "test_imu_faults: a_momentary_fault_costs_little, the_filter_stays_consistent_after_a_fault,"

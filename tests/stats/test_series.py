@@ -4,10 +4,14 @@ as they say.
 
 from __future__ import annotations
 
+import warnings
+
 import numpy as np
 import pytest
 from gpvo.stats import series, student_t
 from gpvo.stats.series import Interval, allan_deviation, autocorrelation, block_bootstrap, sequence_bootstrap
+from hypothesis import given
+from hypothesis import strategies as st
 
 N = 40_000
 TRIALS = 300
@@ -141,3 +145,10 @@ def test_interval_of_a_long_series_that_changes_its_level_costs_few_products():
 
     series._memory(np.repeat([1.0, 8.0], 10_000).view(Counted))
     assert 0 < Counted.products < 2000
+
+
+@given(st.lists(st.floats(allow_nan=True, allow_infinity=True), max_size=9).map(np.array))
+def test_the_median_is_numpys_to_the_last_bit(values):
+    with np.errstate(all="ignore"), warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        np.testing.assert_array_equal(series.median(values), np.median(values))

@@ -17,10 +17,10 @@ from gpvo.geometry import se3
 from gpvo.geometry.covariance import is_positive_definite
 from gpvo.sim.rig import camera_rig
 from gpvo.types import Array, StereoCamera
+from gpvo.vo.covariance import NoiseEstimator
 from gpvo.vo.motion import refine, whitened
 from gpvo.vo.rig_error import N_TERMS, RigError, RigState, prior_covariance, terms
 from gpvo.vo.rig_findings import camchain, corrected, document, explained_px, findings, read_state, rig_of
-from gpvo.vo.sigmas import NoiseEstimator
 
 CAMERA = StereoCamera(380.0, 380.0, 319.5, 239.5, 0.12, 640, 480)
 

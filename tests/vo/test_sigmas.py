@@ -5,10 +5,9 @@ from __future__ import annotations
 import numpy as np
 import pytest
 from gpvo.geometry import se3
-from gpvo.vo.covariance import motion_covariance
+from gpvo.vo.covariance import DesignEffect, NoiseEstimator, ResidualMoments, SigmaEstimator, motion_covariance
 from gpvo.vo.motion import refine, transfer, whitened
 from gpvo.vo.points import PointNoise, pointing_matching_pixel_covariance
-from gpvo.vo.sigmas import DesignEffect, NoiseEstimator, ResidualMoments, SigmaEstimator
 from stereo_points import CAMERA, noisy, scene
 
 

@@ -18,6 +18,7 @@ from gpvo.vo.frontend import Matches, Observation, RightSearch
 from gpvo.vo.motion import Motion, refine, transfer
 from gpvo.vo.odometry import StereoOdometry
 from gpvo.vo.opencv import Light, halve, in_light_of
+from gpvo.vo.patches import align, cut
 from gpvo.vo.quality import PairWatch
 from gpvo.vo.rivals import areas, unexplained, untangled
 from stereo_points import CAMERA, scene
@@ -179,13 +180,17 @@ def test_noise_looks_like_nothing() -> None:
     rng = np.random.default_rng(0)
     a, b = (rng.normal(100, 3, (240, 320)).round().astype(np.uint8) for _ in range(2))
     points = opencv.corners(a, 200, 0.01, 8, None)
-    _, found, alike = opencv.track(a, b, points, points, 21, 3)
+    upright, patches = np.tile(np.eye(2), (len(points), 1, 1)), cut(a, points, 21)
+    moved, found = opencv.track(a, b, points, points, 21, 3)
     assert found.mean() > 0.8
-    assert alike.mean() < 0.1
+    flat = np.zeros((len(points), 2))
+    for h in (flat, None):
+        assert align(patches, b, moved, upright, h).alike.mean() < 0.1
     noisy = np.clip(a + rng.normal(0, 1, a.shape), 0, 255).round().astype(np.uint8)
-    moved, _, alike = opencv.track(a, noisy, points, points, 21, 3)
-    assert alike.mean() > 0.95
-    assert np.abs(moved - points)[alike].max() < 0.5
+    moved, _ = opencv.track(a, noisy, points, points, 21, 3)
+    again = align(patches, noisy, moved, upright, flat)
+    assert again.alike.mean() > 0.95
+    assert np.abs(again.uv - points)[again.alike].max() < 0.5
 
 
 def test_rows_that_lag_behind_are_a_delay() -> None:
@@ -282,7 +287,7 @@ def test_the_stress_list_on_a_drive() -> None:
     for part in parts[1:]:
         late = stress.run(stress.late_right(part))
         assert late.count(Status.OK) == 0
-        assert (late.error_m[1:] > 0.3 * late.moved_m[1:]).mean() > 0.5  # what it sees is no motion
+        assert (late.error_m[1:] > 0.2 * late.moved_m[1:]).mean() > 0.5  # what it sees is no motion, so none may be ok
 
 
 @pytest.mark.slow

@@ -1,0 +1,138 @@
+"""The last step of every search: a patch is found again as the picture of a small plane, not of a moving square.
+
+Lucas and Kanade's search moves a square of the image until it fits. But what is seen from nearer is larger, and in the
+other camera it is sheared, so that the square which fits best is off by as much as the texture lies off its middle:
+some hundredths of a pixel, and on ground that comes near always to the same side. Here the patch deforms as its plane
+does. The plane's slope in disparity is estimated with the disparity, and its deformation by the motion follows from
+the motion that is expected (J. Shi, C. Tomasi, "Good features to track", 1994, section 3, with the deformation known;
+S. Baker, I. Matthews, "Lucas-Kanade 20 years on", 2004, section 3.2: the inverse compositional step). Grey values are
+compared less their mean: what is brighter as a whole has not moved.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from gpvo.types import Array
+from gpvo.vo.opencv import Image, Points
+
+Patches = NDArray[np.float32]
+_STEPS = 2  # the search before ends within a tenth of a pixel
+_FARTHEST_PX = 1.0  # from where that search ended: beyond, the step has followed something else
+_GREY = 4.0  # standard deviation of a grey value
+_SLOPE = 0.3  # of a plane's disparity per pixel, as seen before anything is measured: a level road has about as much
+_ALIKE = 0.9  # difference of two patches of one thing over what varies within; those of noise have 1.1 to 1.4
+
+
+@dataclass(frozen=True)
+class Aligned:
+    """Where patches were found: ``uv`` (N, 2) [px], how they are deformed there, ``A`` (N, 2, 2), and which of them
+    look like what was sought, ``alike`` (N,).
+
+    In noise a search succeeds wherever it starts. But two patches of noise differ by more than varies within each: at a
+    correlation of r, the variance of the difference is ``2 (1 - r)`` times that.
+    """
+
+    uv: Points
+    A: Array
+    alike: NDArray[np.bool_]
+
+
+def cut(image: Image, uv: Points, window_px: int) -> Patches:
+    """Patches (N, 3, M) around points (N, 2): the grey values and their derivatives by u and v, of M pixels each.
+
+    Between pixels by bilinear interpolation.
+    """
+    h, w = image.shape
+    whole = np.floor(uv).astype(np.intp)
+    a, b = (uv - whole).astype(np.float32).T[:, :, None, None]
+    half = (window_px - 1) // 2
+    offset = np.arange(-half - 1, window_px - half + 2)
+    column = np.clip(whole[:, :1] + offset, 0, w - 1)
+    row = np.clip(whole[:, 1:] + offset, 0, h - 1) * w
+    grey = image.ravel().take(row[:, :, None] + column[:, None, :]).astype(np.float32)
+    level = grey[:, :, :-1] + a * (grey[:, :, 1:] - grey[:, :, :-1])
+    grey = level[:, :-1] + b * (level[:, 1:] - level[:, :-1])
+    out = np.empty((len(uv), 3, window_px, window_px), np.float32)
+    out[:, 0] = grey[:, 1:-1, 1:-1]
+    np.subtract(grey[:, 1:-1, 2:], grey[:, 1:-1, :-2], out=out[:, 1])
+    np.subtract(grey[:, 2:, 1:-1], grey[:, :-2, 1:-1], out=out[:, 2])
+    out[:, 1:] *= 0.5
+    return out.reshape(len(uv), 3, window_px**2)
+
+
+def align(patches: Patches, image: Image, start: Points, A: Array, h: Array | None = None) -> Aligned:
+    """Patches (N, 3, M), as of :func:`cut`, found in another image near ``start`` (N, 2), deformed by ``A`` (N, 2, 2).
+
+    A pixel at ``o`` from the middle of the patch is seen at ``uv + A o / (1 + h o)``, with ``h`` (N, 2) the growth of
+    depth over the patch. None for a pair's other camera, where each row of a patch moves along itself: then the first
+    row of ``A`` is estimated as well.
+    """
+    sheared = h is None
+    size = math.isqrt(patches.shape[2])
+    y, x = (o.ravel().astype(np.float32) - (size - 1) // 2 for o in np.indices((size, size)))
+    D = patches[:, (1, 2, 1, 1)[: 4 if sheared else 2]]
+    if sheared:
+        D[:, 2] *= x
+        D[:, 3] *= y
+    D -= D.mean(axis=2, keepdims=True)
+    H = (D @ D.transpose(0, 2, 1)).astype(np.float64)
+    prior = np.array([1e-3, 1e-3] + [(_GREY / _SLOPE) ** 2] * 2 * sheared)
+    H[:, range(len(prior)), range(len(prior))] += prior
+    gain = np.linalg.inv(H)
+    sought = patches[:, 0] - patches[:, 0].mean(axis=1, keepdims=True)
+    # Half the depth within a patch is no plane but a wrong slope.
+    nearer = None if h is None else (1.0 / np.maximum(1.0 + h[:, :1] * x + h[:, 1:] * y, 0.5)).astype(np.float32)
+    uv, A, misfit = start.astype(np.float64), A.copy(), np.zeros_like(sought)
+    for _ in range(_STEPS):
+        misfit = _sampled(image, uv, A, x, y, nearer)
+        misfit -= misfit.mean(axis=1, keepdims=True)
+        misfit -= sought
+        r = (D @ misfit[:, :, None])[:, :, 0].astype(np.float64)
+        if sheared:
+            r[:, 2:] += prior[2:] * (A[:, 0] - (1.0, 0.0))
+        step = np.clip(np.einsum("nij,nj->ni", gain, r), -1.0, 1.0)
+        uv -= np.einsum("nij,nj->ni", A, step[:, :2])
+        if sheared:
+            A[:, 0] -= step[:, 2:]
+    alike = np.abs(misfit).mean(axis=1) < _ALIKE * np.abs(sought).mean(axis=1)
+    alike &= np.abs(uv - start).max(axis=1, initial=0.0) < _FARTHEST_PX
+    return Aligned(uv.astype(np.float32), A, alike)
+
+
+def _sampled(
+    image: Image, uv: Array, A: Array, x: Patches, y: Patches, nearer: Patches | None = None
+) -> NDArray[np.float32]:
+    """(N, M) grey values at ``uv + A (x, y) nearer``, by bilinear interpolation; OpenCV's rounds to 1/32 of a pixel."""
+    h, w = image.shape
+    B, c = A.astype(np.float32), uv.astype(np.float32)
+    u = B[:, 0, :1] * x + B[:, 0, 1:] * y
+    v = B[:, 1, :1] * x + B[:, 1, 1:] * y
+    if nearer is not None:
+        u *= nearer
+        v *= nearer
+    u += c[:, :1]
+    v += c[:, 1:]
+    np.clip(u, 0.0, w - 1.001, out=u)
+    np.clip(v, 0.0, h - 1.001, out=v)
+    column, row = u.astype(np.int32), v.astype(np.int32)
+    u -= column
+    v -= row
+    row *= w
+    row += column
+    flat = image.ravel()
+    a, b, c, d = (flat.take(row + k).astype(np.float32) for k in (0, 1, w, w + 1))
+    b -= a
+    b *= u
+    b += a
+    d -= c
+    d *= u
+    d += c
+    d -= b
+    d *= v
+    d += b
+    return d
