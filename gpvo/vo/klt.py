@@ -293,10 +293,9 @@ class KltFrontend:
 
     def _right_search(self, both: _Found, row_motion: Array) -> RightSearch:
         """What the search in the right image came to; the first points were followed and have moved down so far."""
-        uvd, row_error, n = both.seen.uvd, both.row_error, len(row_motion)
-        measured = row_error
+        uvd, n = both.seen.uvd, len(row_motion)
         d_expected, row_expected = self._rig_error.errors(uvd)
-        disparity, row_error = uvd[:, 2] - d_expected, row_error - row_expected
+        disparity, row_error = uvd[:, 2] - d_expected, both.row_error - row_expected
         # A pair that is off by the same rows everywhere is still a pair: its rows are counted from there.
         usual = float(np.median(row_error[np.isfinite(row_error)])) if np.isfinite(row_error).any() else 0.0
         off_row = np.abs(row_error - usual) > self._config.max_row_error_px
@@ -310,7 +309,7 @@ class KltFrontend:
             int((both.good & ~off_row & ~far & ~behind).sum()),
             int(behind.sum()),
             int(off_row.sum()),
-            measured[:n][seen],  # an image that is late would else be taken for a rig that is off
+            both.row_error[:n][seen],  # as measured: an image that is late would else be taken for a rig that is off
             row_motion[seen],
         )
 
