@@ -8,7 +8,7 @@ are logs of another odometry. Each sequence is judged by models of the others. W
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any, Literal
 
@@ -159,14 +159,35 @@ def _each_by_the_others(e: Experiment, name: str, runs_of: Callable[[str], tuple
         yield Cell(e, way, "real", tuple(job for job in jobs if job is not None))
 
 
-def score(flights: Sequence[Bounds]) -> dict[str, Any]:
-    """Scores of one way of one row over flights [m], each of which counts alike, as ``results.json`` has them.
+@dataclass(frozen=True)
+class Scores:
+    """One way of one row [m]; the names are those of ``results.json``.
 
     Roots of mean squares over the flights, ``*_interval``: 95 % of a bootstrap by flight, None with fewer than three.
     ``ratio``: predicted over actual final error. ``vector``: position error after the predicted mean is taken off;
     ``magnitude``: |error| minus its predicted expectation, the thesis' residual. ``coverage_3_sigma``: share of
     position errors inside, per axis.
     """
+
+    seeds: int
+    rmse_m: float
+    rmse_interval_m: Interval | None
+    final_error_m: float
+    final_error_interval_m: Interval | None
+    predicted_final_error_m: float
+    ratio: float
+    ratio_interval: Interval | None
+    vector_residual_m: float
+    vector_over_rmse: float
+    vector_over_rmse_interval: Interval | None
+    magnitude_residual_m: float
+    magnitude_over_rmse: float
+    magnitude_over_rmse_interval: Interval | None
+    coverage_3_sigma: float
+
+
+def score(flights: Sequence[Bounds]) -> Scores:
+    """Scores over flights; each flight counts alike."""
     squared_error = np.array([(b.error_m**2).sum(1).mean() for b in flights])
     final, predicted = squared_ends(flights)
     vector = np.array([((b.error_m - b.mean_m) ** 2).sum(1).mean() for b in flights])
@@ -174,20 +195,18 @@ def score(flights: Sequence[Bounds]) -> dict[str, Any]:
     magnitude = np.array([((np.linalg.norm(b.error_m, axis=1) - m) ** 2).mean() for b, m in zip(flights, expected)])
     inside = [(np.abs(b.error_m - b.mean_m) <= 3 * b.sigma_m + 1e-9).mean() for b in flights]
     one = np.ones(len(flights))
-    out: dict[str, Any] = {"seeds": len(flights)}
-    for name, interval, above, below in (
-        ("rmse_m", "rmse_interval_m", squared_error, one),
-        ("final_error_m", "final_error_interval_m", final, one),
-        ("predicted_final_error_m", "", predicted, one),
-        ("ratio", "ratio_interval", predicted, final),
-        ("vector_residual_m", "", vector, one),
-        ("vector_over_rmse", "vector_over_rmse_interval", vector, squared_error),
-        ("magnitude_residual_m", "", magnitude, one),
-        ("magnitude_over_rmse", "magnitude_over_rmse_interval", magnitude, squared_error),
-    ):
-        out[name], found = pooled(above, below)
-        out |= {interval: found} if interval else {}
-    return out | {"coverage_3_sigma": float(np.mean(inside))}
+    return Scores(
+        len(flights),
+        *pooled(squared_error, one),
+        *pooled(final, one),
+        pooled(predicted, one)[0],
+        *pooled(predicted, final),
+        pooled(vector, one)[0],
+        *pooled(vector, squared_error),
+        pooled(magnitude, one)[0],
+        *pooled(magnitude, squared_error),
+        float(np.mean(inside)),
+    )
 
 
 def squared_ends(flights: Sequence[Bounds]) -> tuple[Array, Array]:
@@ -233,14 +252,14 @@ def over_seeds(seeds: int, statistic: Callable[[NDArray[np.int64]], Array]) -> I
 
 def scored(cells: Sequence[Cell], store: Store) -> list[dict[str, Any]]:
     """One entry per experiment and mode, in the order of the cells, as scripts read it."""
-    made: dict[tuple[BoundsJob, ...], dict[str, Any]] = {}
+    made: dict[tuple[BoundsJob, ...], Scores] = {}
     out: dict[tuple[str, str], dict[str, Any]] = {}
     for cell in cells:
         # Cells of several tables share their bounds, and the work.
         found = made.get(cell.jobs) or made.setdefault(cell.jobs, score(cell.load(store)))
         key = (cell.experiment.key, cell.mode)
-        row = out.setdefault(key, {**_head(cell.experiment), "mode": cell.mode, "seeds": found["seeds"], "ways": {}})
-        row["ways"][cell.way] = dict(found)
+        row = out.setdefault(key, {**_head(cell.experiment), "mode": cell.mode, "seeds": found.seeds, "ways": {}})
+        row["ways"][cell.way] = asdict(found)
     return list(out.values())
 
 
