@@ -15,8 +15,9 @@ READ_BY_OTHERS = frozenset(
         "showwarning", "format_commands", "__signature__", "__annotations__", "model_config",  # hooks of libraries
         "producer_name", "typingctx",  # of ONNX and Numba
         "BagSource", "EurocSource", "KittiSource", "SklearnRegressor", "SvgpRegressor",  # named as texts in registries
-        "rotvec_rad", "nll_stated_per_dim", "nees_dof_median_stated", "tolerance_name", "residual_sigma_p_px",
-        "residual_sigma_m_px",  # fields that documents and tables take by name
+        "rotvec_rad", "nll_stated_per_dim", "nees_dof_median_stated", "rmse_interval_m",
+        "final_error_interval_m", "vector_residual_m", "magnitude_residual_m", "magnitude_over_rmse_interval",
+        "tolerance_name", "residual_sigma_p_px", "residual_sigma_m_px",  # fields that documents and tables take by name
     }
 )  # fmt: skip
 """Names that nothing calls by that name."""
