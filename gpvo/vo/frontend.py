@@ -93,8 +93,8 @@ class Followed:
 class Frontend(Protocol):
     """Turns frames into matches. The odometry calls ``observe``, then ``match``, then perhaps ``promote``."""
 
-    def observe(self, frame: StereoFrame | TrackFrame) -> Observation:
-        """Take in a new frame."""
+    def observe(self, frame: StereoFrame | TrackFrame, *, stays: bool = False) -> Observation:
+        """Take in a new frame. ``stays``: the reference is expected to stay, so that no new points will be wanted."""
 
     def match(self, T_prev_cur_guess: Array, *, from_scratch: bool = False) -> Matches:
         """Points of the reference found in the observed frame, near where the guess puts them.
@@ -166,7 +166,7 @@ class TrackFrontend(_AfreshFrontend):
     def __init__(self, rig_error: RigError, config: VoConfig) -> None:
         self._rig_error, self._config = rig_error, config
 
-    def observe(self, frame: StereoFrame | TrackFrame) -> Observation:
+    def observe(self, frame: StereoFrame | TrackFrame, *, stays: bool = False) -> Observation:
         """Take in a :class:`TrackFrame`; a non-finite pixel or an impossible disparity drops its point."""
         assert isinstance(frame, TrackFrame)
         uvd, row_error = stereo_uvd(frame.uv_left, frame.uv_right)
@@ -192,7 +192,7 @@ class DescriptorFrontend(_AfreshFrontend):
         self._images: tuple[opencv.Image, opencv.Image] | None = None
         self._pool = ThreadPoolExecutor(1)
 
-    def observe(self, frame: StereoFrame | TrackFrame) -> Observation:
+    def observe(self, frame: StereoFrame | TrackFrame, *, stays: bool = False) -> Observation:
         """Detect, describe and match left to right."""
         assert isinstance(frame, StereoFrame)
         before, self._images = self._images, (frame.left, frame.right)

@@ -53,6 +53,15 @@ class _Seen:
         return _Seen(*(np.concatenate(pair) for pair in both))
 
 
+@dataclass(frozen=True)
+class _Survey:
+    """What new points start from: corners (N, 2) of the half-size left image, strongest first, and the disparity (H, W)
+    at a quarter of the size, negative where it is not known."""
+
+    corners: Points
+    disparity: NDArray[np.float32]
+
+
 @dataclass
 class _View:
     """One observed pair and what was found in it."""
@@ -63,10 +72,20 @@ class _View:
     half_right: Image
     light_left: Light
     right_as_left: Image  # the right image in the left's light
-    survey: Future[tuple[Points, NDArray[np.float32]]]  # corners (N, 2) of the half image, disparity of a quarter one
     seen: _Seen  # usable as reference
+    survey: Future[_Survey] | None = None  # once begun
     strong: int = 0  # the points from here on are spare ones
     features: tuple[Points, NDArray[np.uint8]] | None = None  # those of the left image to find again, once asked for
+
+
+@dataclass(frozen=True)
+class _Found:
+    """What the search in the right image came to: for each point sought ``seen``, whether it can be believed, ``good``
+    (N,), and by how much the right row lies below the left one, ``row_error`` (N,), NaN where nothing was found."""
+
+    seen: _Seen
+    good: NDArray[np.bool_]
+    row_error: Array
 
 
 @dataclass(frozen=True)
@@ -80,15 +99,11 @@ class _New:
     seen: _Seen
     strong: int
 
-
-@dataclass(frozen=True)
-class _Found:
-    """What the search in the right image came to: for each point sought ``seen``, whether it can be believed, ``good``
-    (N,), and by how much the right row lies below the left one, ``row_error`` (N,), NaN where nothing was found."""
-
-    seen: _Seen
-    good: NDArray[np.bool_]
-    row_error: Array
+    @classmethod
+    def of(cls, detected: int, found: _Found, known: int) -> _New:
+        """What the search came to after the ``known`` points; of the new ones ``detected`` are the image's best."""
+        seen, good = found.seen[known:], found.good[known:]
+        return cls(detected, seen[good], int(good[:detected].sum()))
 
 
 def _equal(half_a: Image, half_b: Image, a: Image, b: Image) -> bool:
@@ -112,19 +127,21 @@ class KltFrontend:
         self._current: _View | None = None
         no_patches = np.empty((0, 3, config.klt_window_px**2), np.float32)
         self._nothing = _Seen(np.empty((0, 2), np.float32), np.empty((0, 3)), np.empty((0, 2)), no_patches)
-        self._new, self._matched = _New(0, self._nothing, 0), self._nothing
+        self._new: _New | None = None
+        self._matched = self._nothing
         self._pool = ThreadPoolExecutor(1)
 
-    def observe(self, frame: StereoFrame | TrackFrame) -> Observation:
+    def observe(self, frame: StereoFrame | TrackFrame, *, stays: bool = False) -> Observation:
         """Take in a rectified pair."""
         assert isinstance(frame, StereoFrame)
         before = self._current
         half_left, half_right = opencv.halve(frame.left), opencv.halve(frame.right)
         light_left, light_right = Light.of(half_left), Light.of(half_right)
         right = in_light_of(frame.right, light_right, light_left)
-        # New corners and rough depth are wanted only after the motion; they are found beside it.
-        survey = self._pool.submit(self._survey, half_left, half_right)
-        self._current = _View(frame.left, frame.right, half_left, half_right, light_left, right, survey, self._nothing)
+        self._current = _View(frame.left, frame.right, half_left, half_right, light_left, right, self._nothing)
+        self._new = None
+        if not stays:
+            self._begin_survey(self._current)  # beside what comes first
         same_left = before is not None and _equal(before.half_left, half_left, before.left, frame.left)
         same_right = before is not None and _equal(before.half_right, half_right, before.right, frame.right)
         return Observation(
@@ -145,7 +162,9 @@ class KltFrontend:
             return self._find_again(reference, current)
         followed, found, uv, disparity, slope = self._follow(reference, current, T_prev_cur_guess)
         before, n = reference.seen[found], len(uv)
-        both = self._with_new_corners(current, uv, disparity, slope)
+        # New corners are sought beside the known points where the survey has begun, and else when they are wanted.
+        search = self._find_right if current.survey is None else self._with_new_corners
+        both = search(current, uv, disparity, slope)
         good = both.good[:n]
         self._matched = both.seen[:n][good]
         return Matches(
@@ -182,15 +201,14 @@ class KltFrontend:
         current = self._current
         assert current is not None
         if inliers is None:
-            self._matched = self._nothing
-            self._with_new_corners(current, self._nothing.left_uv, np.empty(0), self._nothing.slope)
+            self._matched, self._new = self._nothing, None
             inliers = np.zeros(0, bool)
-        kept, new = self._matched[inliers], self._new
+        kept, new = self._matched[inliers], self._new or self._new_beside(current, self._matched.left_uv)
         current.seen = kept + new.seen
         current.strong = len(kept) + new.strong
         if current.strong >= at_least:
             self._reference = current
-        self._matched, self._new = self._nothing, _New(0, self._nothing, 0)
+        self._matched, self._new = self._nothing, None
         return len(kept) + new.detected, current.strong
 
     def _expected(self, seen: _Seen, T_prev_cur: Array) -> tuple[Array, Array, Array, Array]:
@@ -214,23 +232,26 @@ class KltFrontend:
         slope = np.where(visible[:, None], there, seen.slope)
         return np.where(visible[:, None], np.column_stack([u, v, d]), seen.uvd), A, h, slope
 
-    def _survey(self, half_left: Image, half_right: Image) -> tuple[Points, NDArray[np.float32]]:
-        """Corners of the half-size left image, strongest first, and disparity at a quarter of the size."""
+    def _begin_survey(self, view: _View) -> Future[_Survey]:
+        if view.survey is None:
+            view.survey = self._pool.submit(self._survey, view.half_left, view.half_right)
+        return view.survey
+
+    def _survey(self, half_left: Image, half_right: Image) -> _Survey:
         config = self._config
         limit = int(config.max_disparity_share * self._camera.width / 4)
         # Many: where a strong texture holds the best corners, others must be left to speak for the scene.
         found = opencv.corners(
             half_left, 8 * config.max_features, config.corner_quality, config.min_distance_px / 2, self._half_mask
         )
-        return found, opencv.coarse_disparity(opencv.halve(half_left), opencv.halve(half_right), limit)
+        return _Survey(found, opencv.coarse_disparity(opencv.halve(half_left), opencv.halve(half_right), limit))
 
     def _new_corners(self, view: _View, taken_uv: Points) -> tuple[Points, Array, int]:
         """Corners (N, 2) away from those taken, on even pixels of the full image, and their rough disparity (N,).
 
         The first of them, whose number comes last, are the image's best; the others stand alone in their parts of it.
         """
-        corners, _ = view.survey.result()
-        uv, limit = corners * 2.0, self._config.max_features
+        uv, limit = self._begin_survey(view).result().corners * 2.0, self._config.max_features
         strong = uv[:limit]
         if len(taken_uv) and len(uv):
             # Axis by axis in float32: a tenth of the time of a sum over the last axis.
@@ -243,7 +264,7 @@ class KltFrontend:
 
     def _rough(self, view: _View, uv: Points) -> tuple[Points, Array]:
         """Points (N, 2) of the left image with their rough disparity (N,)."""
-        _, coarse = view.survey.result()
+        coarse = self._begin_survey(view).result().disparity
         column, row = (uv / 4).astype(int).T
         near = coarse[np.clip(row, 0, coarse.shape[0] - 1), np.clip(column, 0, coarse.shape[1] - 1)]
         known = near >= 0
@@ -267,9 +288,13 @@ class KltFrontend:
             np.concatenate([disparity, new_disparity]),
             np.concatenate([slope, np.zeros((len(new_uv), 2))]),
         )
-        new, good = found.seen[len(uv) :], found.good[len(uv) :]
-        self._new = _New(detected, new[good], int(good[:detected].sum()))
+        self._new = _New.of(detected, found, len(uv))
         return found
+
+    def _new_beside(self, view: _View, taken_uv: Points) -> _New:
+        """New corners between those taken (N, 2), which are measured already."""
+        uv, disparity, detected = self._new_corners(view, taken_uv)
+        return _New.of(detected, self._find_right(view, uv, disparity, np.zeros((len(uv), 2))), 0)
 
     def _find_right(self, view: _View, uv_left: Points, disparity: Array, slope: Array) -> _Found:
         """Points (N, 2) of the left image sought in the right one, from a guessed disparity (N,) and slope (N, 2)."""

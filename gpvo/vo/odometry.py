@@ -88,7 +88,7 @@ class StereoOdometry:
         clock = Stopwatch()
         frame = own_frame(frame, self.camera, None if self._state is None else self._state.t_last_ns)
         frontend = self._frontend = self._frontend or self._new_frontend(frame)
-        seen = frontend.observe(frame)
+        seen = frontend.observe(frame, stays=self._state is not None and self._state.stays(self.config))
         clock.lap("observe")
         if self._state is None:
             counts = frontend.promote(None)
@@ -302,10 +302,7 @@ class StereoOdometry:
         inliers = motion.inliers
         parallax_px = median_parallax_px(matches, inliers)
         state.believe(record.t_ns, record.T_prev_cur, parallax_px, int(inliers.sum()), tells=tells)
-        at_rest = state.parallax_from_reference_px < config.keyframe_parallax_px
-        # Beside a rival the reference stays fresh: what moves otherwise is seen in two frames or never.
-        beside = state.rivalry > 0.2 or state.leaps.before is not None
-        if at_rest and not beside and inliers.sum() > 0.6 * state.reference_points:
+        if state.suffices(parallax_px, config) and inliers.sum() > 0.6 * state.reference_points:
             return False, (state.reference_points, state.reference_points)
         kept = inliers if state.rival is None else state.rival
         counts = self._frontend.promote(kept, at_least=config.min_inliers)

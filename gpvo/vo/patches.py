@@ -21,7 +21,8 @@ from gpvo.types import Array
 from gpvo.vo.opencv import Image, Points
 
 Patches = NDArray[np.float32]
-_STEPS = 2  # the search before ends within a tenth of a pixel
+_STEPS = 3  # at most: the search before ends within a tenth of a pixel
+_CLOSE_PX = 0.03  # a step this small leaves an error of a tenth of it
 _FARTHEST_PX = 1.0  # from where that search ended: beyond, the step has followed something else
 _GREY = 4.0  # standard deviation of a grey value
 _SLOPE = 0.3  # of a plane's disparity per pixel, as seen before anything is measured: a level road has about as much
@@ -45,7 +46,7 @@ class Aligned:
 def cut(image: Image, uv: Points, window_px: int) -> Patches:
     """Patches (N, 3, M) around points (N, 2): the grey values and their derivatives by u and v, of M pixels each.
 
-    Between pixels by bilinear interpolation.
+    Between pixels by bilinear interpolation; all three less their means, as light is no motion.
     """
     h, w = image.shape
     whole = np.floor(uv).astype(np.intp)
@@ -62,7 +63,9 @@ def cut(image: Image, uv: Points, window_px: int) -> Patches:
     np.subtract(grey[:, 1:-1, 2:], grey[:, 1:-1, :-2], out=out[:, 1])
     np.subtract(grey[:, 2:, 1:-1], grey[:, :-2, 1:-1], out=out[:, 2])
     out[:, 1:] *= 0.5
-    return out.reshape(len(uv), 3, window_px**2)
+    patches = out.reshape(len(uv), 3, window_px**2)
+    patches -= patches.mean(axis=2, keepdims=True)
+    return patches
 
 
 def align(patches: Patches, image: Image, start: Points, A: Array, h: Array | None = None) -> Aligned:
@@ -72,60 +75,58 @@ def align(patches: Patches, image: Image, start: Points, A: Array, h: Array | No
     depth over the patch. None for a pair's other camera, where each row of a patch moves along itself: then the first
     row of ``A`` is estimated as well.
     """
-    sheared = h is None
-    size = math.isqrt(patches.shape[2])
-    y, x = (o.ravel().astype(np.float32) - (size - 1) // 2 for o in np.indices((size, size)))
-    D = patches[:, (1, 2, 1, 1)[: 4 if sheared else 2]]
+    sheared, size = h is None, math.isqrt(patches.shape[2])
+    xy = np.indices((size, size), np.float32)[::-1].reshape(2, size**2) - (size - 1) // 2
+    sought, D = patches[:, 0], patches[:, 1:]
     if sheared:
-        D[:, 2] *= x
-        D[:, 3] *= y
-    D -= D.mean(axis=2, keepdims=True)
-    H = (D @ D.transpose(0, 2, 1)).astype(np.float64)
+        by_slope = D[:, :1] * xy
+        by_slope -= by_slope.mean(axis=2, keepdims=True)
+        D = np.concatenate([D, by_slope], axis=1)
     prior = np.array([1e-3, 1e-3] + [(_GREY / _SLOPE) ** 2] * 2 * sheared)
-    H[:, range(len(prior)), range(len(prior))] += prior
-    gain = np.linalg.inv(H)
-    sought = patches[:, 0] - patches[:, 0].mean(axis=1, keepdims=True)
+    gain = np.linalg.inv((D @ D.transpose(0, 2, 1)).astype(np.float64) + np.diag(prior))
     # Half the depth within a patch is no plane but a wrong slope.
-    nearer = None if h is None else (1.0 / np.maximum(1.0 + h[:, :1] * x + h[:, 1:] * y, 0.5)).astype(np.float32)
-    uv, A, misfit = start.astype(np.float64), A.copy(), np.zeros_like(sought)
+    nearer = None if h is None else 1.0 / np.maximum(1.0 + h.astype(np.float32) @ xy, np.float32(0.5))
+    uv, A, apart = start.astype(np.float64), A.copy(), np.abs(sought).mean(axis=1)
+    limit, going = _ALIKE * apart, np.arange(len(patches))
     for _ in range(_STEPS):
-        misfit = _sampled(image, uv, A, x, y, nearer)
+        misfit = _sampled(image, uv[going], A[going], xy, nearer)
         misfit -= misfit.mean(axis=1, keepdims=True)
         misfit -= sought
+        apart[going] = np.abs(misfit).mean(axis=1)
         r = (D @ misfit[:, :, None])[:, :, 0].astype(np.float64)
         if sheared:
-            r[:, 2:] += prior[2:] * (A[:, 0] - (1.0, 0.0))
-        step = np.clip(np.einsum("nij,nj->ni", gain, r), -1.0, 1.0)
-        uv -= np.einsum("nij,nj->ni", A, step[:, :2])
+            r[:, 2:] += prior[2:] * (A[going, 0] - (1.0, 0.0))
+        step = np.clip((gain @ r[:, :, None])[:, :, 0], -1.0, 1.0)
+        uv[going] -= (A[going] @ step[:, :2, None])[:, :, 0]
         if sheared:
-            A[:, 0] -= step[:, 2:]
-    alike = np.abs(misfit).mean(axis=1) < _ALIKE * np.abs(sought).mean(axis=1)
-    alike &= np.abs(uv - start).max(axis=1, initial=0.0) < _FARTHEST_PX
+            A[going, 0] -= step[:, 2:]
+        step[:, 2:] *= size / 4
+        far = np.abs(step).max(axis=1, initial=0.0) > _CLOSE_PX
+        if not far.any():
+            break
+        going, D, gain, sought = going[far], D[far], gain[far], sought[far]
+        nearer = None if nearer is None else nearer[far]
+    alike = (apart < limit) & (np.abs(uv - start).max(axis=1, initial=0.0) < _FARTHEST_PX)
     return Aligned(uv.astype(np.float32), A, alike)
 
 
-def _sampled(
-    image: Image, uv: Array, A: Array, x: Patches, y: Patches, nearer: Patches | None = None
-) -> NDArray[np.float32]:
-    """(N, M) grey values at ``uv + A (x, y) nearer``, by bilinear interpolation; OpenCV's rounds to 1/32 of a pixel."""
+def _sampled(image: Image, uv: Array, A: Array, xy: Patches, nearer: Patches | None = None) -> NDArray[np.float32]:
+    """(N, M) grey values at ``uv + A xy nearer``, by bilinear interpolation; OpenCV's rounds to 1/32 of a pixel."""
     h, w = image.shape
-    B, c = A.astype(np.float32), uv.astype(np.float32)
-    u = B[:, 0, :1] * x + B[:, 0, 1:] * y
-    v = B[:, 1, :1] * x + B[:, 1, 1:] * y
-    if nearer is not None:
-        u *= nearer
-        v *= nearer
-    u += c[:, :1]
-    v += c[:, 1:]
-    np.clip(u, 0.0, w - 1.001, out=u)
-    np.clip(v, 0.0, h - 1.001, out=v)
-    column, row = u.astype(np.int32), v.astype(np.int32)
-    u -= column
-    v -= row
-    row *= w
-    row += column
+    at, parts = np.zeros(1, np.int32), []
+    for k, size, stride in ((0, w, 1), (1, h, w)):
+        u = A[:, k].astype(np.float32) @ xy
+        if nearer is not None:
+            u *= nearer
+        u += uv[:, k : k + 1].astype(np.float32)
+        np.clip(u, 0.0, size - 1.001, out=u)
+        whole = np.floor(u)
+        u -= whole
+        at = at + whole.astype(np.int32) * stride
+        parts.append(u)
+    u, v = parts
     flat = image.ravel()
-    a, b, c, d = (flat.take(row + k).astype(np.float32) for k in (0, 1, w, w + 1))
+    a, b, c, d = (flat.take(at + k).astype(np.float32) for k in (0, 1, w, w + 1))
     b -= a
     b *= u
     b += a

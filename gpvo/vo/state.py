@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 from gpvo.errors import SourceError
 from gpvo.geometry import se3
 from gpvo.types import Array, StereoCamera, StereoFrame, TrackFrame
+from gpvo.vo.config import VoConfig
 from gpvo.vo.frontend import Observation
 from gpvo.vo.rivals import Expected, Leaps
 
@@ -53,6 +54,17 @@ class State:
     def is_fresh(self, t_ns: int, many: int) -> bool:
         """Whether the reference has ``many`` points, and the last believed motion can still be prolonged."""
         return self.reference_points >= many and (t_ns - self.t_believed_ns) * 1e-9 < _GUESS_S
+
+    def suffices(self, parallax_px: float, config: VoConfig) -> bool:
+        """Whether the reference still serves when the image has moved by ``parallax_px`` since.
+
+        Beside a rival it has to be fresh: what moves otherwise is seen in two frames or never.
+        """
+        return parallax_px < config.keyframe_parallax_px and self.rivalry <= 0.2 and self.leaps.before is None
+
+    def stays(self, config: VoConfig) -> bool:
+        """Whether the reference is expected to serve beyond the next frame."""
+        return self.suffices(self.parallax_from_reference_px + self.parallax_px, config)
 
     def guess(self, t_ns: int) -> Array:
         """Motion from the reference to time ``t_ns`` at constant velocity, for at most half a second."""
