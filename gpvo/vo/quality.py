@@ -211,10 +211,11 @@ class PairWatch:
         n, ee, em, mm = self._rows
         if n < 20 or mm < n:  # rows must move by a pixel
             return self.late
-        if ee < _RIG_PX**2 * n:
-            return 0.0
+        small = ee < _RIG_PX**2 * n
         if em**2 < 0.25 * ee * mm:  # motion must explain a quarter of the error's variance
-            return self.late
+            return 0.0 if small else self.late
+        if small and not self.late:  # so may a wrong rig's; but an image that was late is not in time as it slows down
+            return 0.0
         late = -em / mm
         return float(late) if _LATE < abs(late) < 2.0 else 0.0
 

@@ -204,6 +204,22 @@ def test_rows_that_lag_behind_are_a_delay() -> None:
     assert watch.step(good, RightSearch(200, 200, 0, 0, rng.normal(0, 0.2, 200), motion)) == []
 
 
+def test_a_late_image_is_not_in_time_as_it_slows_down() -> None:
+    """Rows that lag by less than a wrong rig displaces them: a delay where there was one, and else nothing."""
+    rng = np.random.default_rng(0)
+
+    def late(watch: PairWatch, delay: float, speed_px: float) -> bool:
+        motion = rng.normal(0, speed_px, 200)
+        error = -delay * motion + rng.normal(0, 0.2, 200)
+        return any("late" in d for d in watch.step(Observation(None, False), RightSearch(200, 200, 0, 0, error, motion)))
+
+    watch = PairWatch(pinhole(480, 360))
+    assert all(late(watch, 0.8, speed_px) for speed_px in [4.0, *[1.15] * 20])
+    assert not any([late(watch, 0.0, 4.0) for _ in range(20)][10:])
+    watch = PairWatch(pinhole(480, 360))
+    assert not any(late(watch, 0.8, 1.15) for _ in range(20))
+
+
 def test_points_out_of_their_rows_for_a_delay_speak_of_no_calibration() -> None:
     rng = np.random.default_rng(0)
     watch = PairWatch(pinhole(480, 360))
