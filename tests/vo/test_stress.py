@@ -211,7 +211,9 @@ def test_a_late_image_is_not_in_time_as_it_slows_down() -> None:
     def late(watch: PairWatch, delay: float, speed_px: float) -> bool:
         motion = rng.normal(0, speed_px, 200)
         error = -delay * motion + rng.normal(0, 0.2, 200)
-        return any("late" in d for d in watch.step(Observation(None, False), RightSearch(200, 200, 0, 0, error, motion)))
+        return any(
+            "late" in d for d in watch.step(Observation(None, False), RightSearch(200, 200, 0, 0, error, motion))
+        )
 
     watch = PairWatch(pinhole(480, 360))
     assert all(late(watch, 0.8, speed_px) for speed_px in [4.0, *[1.15] * 20])
