@@ -14,6 +14,7 @@ from dataclasses import dataclass, fields
 import numpy as np
 from numpy.typing import NDArray
 
+from gpvo.geometry import se3
 from gpvo.types import Array, StereoCamera, StereoFrame, TrackFrame
 from gpvo.vo import opencv
 from gpvo.vo.config import KNOWN_DEPTH_PX, VoConfig
@@ -214,19 +215,17 @@ class KltFrontend:
     def _expected(self, seen: _Seen, T_prev_cur: Array) -> tuple[Array, Array, Array, Array]:
         """Where a motion puts the points (N, 3), how it deforms their patches, (N, 2, 2) and (N, 2) of :func:`align`,
         and the slope of their disparity there (N, 2); as they were for those it puts out of sight."""
-        moved = transfer(T_prev_cur, seen.uvd, self._camera)
+        c = self._camera
+        moved = transfer(T_prev_cur, seen.uvd, c)
         (u, v, d), G = moved.uvd, moved.G.transpose(2, 0, 1)
-        w, h = self._camera.width, self._camera.height
         A = G[:, :2, :2] + G[:, :2, 2:] * seen.slope[:, None]
         slope = G[:, 2, :2] + G[:, 2, 2:] * seen.slope
-        visible = moved.in_front & (u >= 0) & (u < w) & (v >= 0) & (v < h) & (d < w)
+        visible = moved.in_front & (u >= 0) & (u < c.width) & (v >= 0) & (v < c.height) & (d < c.width)
         visible &= np.abs(A - np.eye(2)).max(axis=(1, 2), initial=0.0) < _MOST_DEFORMED
         # Depth over that of before is linear in the place and in the disparity, and so over a plane.
-        R, t = T_prev_cur[:3, :3].T, -T_prev_cur[:3, :3].T @ T_prev_cur[:3, 3]
-        c = self._camera
-        by_u, by_v, by_d = R[2, 0] / c.fx_px, R[2, 1] / c.fy_px, t[2] / (c.fx_px * c.baseline_m)
-        depth = R[2, 2] + (seen.uvd - (c.cx_px, c.cy_px, 0.0)) @ (by_u, by_v, by_d)
-        h = np.where(visible, 1.0 / np.where(visible, depth, 1.0), 0.0)[:, None] * ((by_u, by_v) + by_d * seen.slope)
+        forward = se3.inverse(T_prev_cur)[2]
+        by_u, by_v, by_d = forward[[0, 1, 3]] / (c.fx_px, c.fy_px, c.fx_px * c.baseline_m)
+        h = ((by_u, by_v) + by_d * seen.slope) * np.where(visible, 1.0 / np.where(visible, moved.depth, 1.0), 0.0)[:, None]
         A = np.where(visible[:, None, None], A, np.eye(2))
         there = np.linalg.solve(A.transpose(0, 2, 1), slope[:, :, None])[:, :, 0]
         slope = np.where(visible[:, None], there, seen.slope)

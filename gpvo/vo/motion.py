@@ -29,12 +29,14 @@ class Transfer:
     """Measurements of the reference frame moved into the current one, with derivatives. Axes last for speed.
 
     ``uvd`` (3, N) prediction; ``H`` (3, 6, N) by a right perturbation of ``T_prev_cur``; ``G`` (3, 3, N) by the
-    reference measurement; ``in_front`` (N,) whether the point lies in front of the camera.
+    reference measurement; ``depth`` (N,) over that in the reference frame; ``in_front`` (N,) whether the point lies in
+    front of the camera.
     """
 
     uvd: Array
     H: Array
     G: Array
+    depth: Array
     in_front: NDArray[np.bool_]
 
 
@@ -88,7 +90,7 @@ def transfer(T_prev_cur: Array, uvd_prev: Array, camera: StereoCamera) -> Transf
     D[2] = -d * back
     D[2, 8] += w
     H, G = D[:, :6], D[:, 6:]
-    return Transfer(uvd, H, G, in_front)
+    return Transfer(uvd, H, G, m[2], in_front)
 
 
 def residual_covariance(G: Array, S_prev: Array, S_cur: Array, persistent: float = 0.0) -> Array:
