@@ -225,7 +225,8 @@ class KltFrontend:
         # Depth over that of before is linear in the place and in the disparity, and so over a plane.
         forward = se3.inverse(T_prev_cur)[2]
         by_u, by_v, by_d = forward[[0, 1, 3]] / (c.fx_px, c.fy_px, c.fx_px * c.baseline_m)
-        h = ((by_u, by_v) + by_d * seen.slope) * np.where(visible, 1.0 / np.where(visible, moved.depth, 1.0), 0.0)[:, None]
+        nearer = np.where(visible, 1.0 / np.where(visible, moved.depth, 1.0), 0.0)
+        h = nearer[:, None] * ((by_u, by_v) + by_d * seen.slope)
         A = np.where(visible[:, None, None], A, np.eye(2))
         there = np.linalg.solve(A.transpose(0, 2, 1), slope[:, :, None])[:, :, 0]
         slope = np.where(visible[:, None], there, seen.slope)

@@ -44,9 +44,10 @@ class Aligned:
 
 
 def cut(image: Image, uv: Points, window_px: int) -> Patches:
-    """Patches (N, 3, M) around points (N, 2): the grey values and their derivatives by u and v, of M pixels each.
+    """Patches (N, 3, M) around points (N, 2): the grey values less their mean, and their derivatives by u and v, of M
+    pixels each.
 
-    Between pixels by bilinear interpolation; all three less their means, as light is no motion.
+    Between pixels by bilinear interpolation.
     """
     h, w = image.shape
     whole = np.floor(uv).astype(np.intp)
@@ -64,7 +65,7 @@ def cut(image: Image, uv: Points, window_px: int) -> Patches:
     np.subtract(grey[:, 2:, 1:-1], grey[:, :-2, 1:-1], out=out[:, 2])
     out[:, 1:] *= 0.5
     patches = out.reshape(len(uv), 3, window_px**2)
-    patches -= patches.mean(axis=2, keepdims=True)
+    patches[:, 0] -= patches[:, 0].mean(axis=1, keepdims=True)
     return patches
 
 
@@ -79,11 +80,12 @@ def align(patches: Patches, image: Image, start: Points, A: Array, h: Array | No
     xy = np.indices((size, size), np.float32)[::-1].reshape(2, size**2) - (size - 1) // 2
     sought, D = patches[:, 0], patches[:, 1:]
     if sheared:
-        by_slope = D[:, :1] * xy
-        by_slope -= by_slope.mean(axis=2, keepdims=True)
-        D = np.concatenate([D, by_slope], axis=1)
+        D = np.concatenate([D, D[:, :1] * xy], axis=1)
     prior = np.array([1e-3, 1e-3] + [(_GREY / _SLOPE) ** 2] * 2 * sheared)
-    gain = np.linalg.inv((D @ D.transpose(0, 2, 1)).astype(np.float64) + np.diag(prior))
+    # Of the derivatives, only what varies over the patch counts; times a misfit without mean, it alone does anyhow.
+    mean = D.mean(axis=2)[:, :, None]
+    H = (D @ D.transpose(0, 2, 1) - size**2 * mean @ mean.transpose(0, 2, 1)).astype(np.float64)
+    gain = np.linalg.inv(H + np.diag(prior))
     # Half the depth within a patch is no plane but a wrong slope.
     nearer = None if h is None else 1.0 / np.maximum(1.0 + h.astype(np.float32) @ xy, np.float32(0.5))
     uv, A, apart = start.astype(np.float64), A.copy(), np.abs(sought).mean(axis=1)
