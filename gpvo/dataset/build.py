@@ -132,7 +132,7 @@ def build(
         raise GpvoError(
             "has no ground truth to learn from",
             where=where or name,
-            cure="run a sequence that has it, or gpvo import --truth",
+            cure="run a sequence that has it, gpvo import --truth, or --twins for a run made with --keep-tracks",
         )
     if target != "position":
         require_attitude(log, truth, where or name)

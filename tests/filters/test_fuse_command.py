@@ -260,6 +260,17 @@ def test_a_run_whose_imu_log_is_elsewhere_in_time(tmp_path: Path) -> None:
         _run("fuse", tmp_path / "late")
 
 
+def test_a_filter_without_an_imu_says_so(runs: list[Path], tmp_path: Path) -> None:
+    run = read_run(runs[0])
+    write_run(tmp_path / "bare", run.log, mounting=run.mounting, truth=run.truth)
+    settings = FusionSettings(policies=("pointing_matching",))
+    for flown, names in (((runs[0],), ""), ((runs[0], tmp_path / "bare"), "bare"), ((tmp_path / "bare",), "any run")):
+        told = [line for line in fuse_runs(flown, settings).warnings if "no IMU" in line]
+        assert told == [f"no IMU in {names}: a model of constant velocity stands in for it"] * bool(names)
+    asked = replace(settings, use_imu=False)
+    assert not any("no IMU" in line for line in fuse_runs([runs[0]], asked).warnings)
+
+
 def test_truth_where_there_is_no_imu_is_no_truth(tmp_path: Path) -> None:
     """At rest, with an IMU in the first half and truth in the second: a start from rest at the origin, and no score."""
     flight = with_geometric(synthetic_flight(1, duration_s=4), np.diag([4e-4] * 3 + [4e-6] * 3), "pointing_matching")
