@@ -282,5 +282,7 @@ def _print_pooled(pooled: dict[str, Any], runs: int) -> None:
             cells += [cell(s["mean"]), "-" if s["low"] is None else f"{cell(s['low'])} to {cell(s['high'])}"]
         rows.append(cells)
     if rows:
-        say(f"mean of the {runs} runs" + ("" if runs > 2 else ": too few for an interval"))
+        few = "" if runs > 2 else ": too few for an interval"
+        say(f"mean of the {runs} runs{few}")
+        say("(NEES with the truth's own noise taken into account, NLL without)")
         show(("method", "NLL", "interval", "NEES", "interval"), rows)

@@ -67,7 +67,7 @@ def _draw(ax: Axes, panel: Panel) -> None:
         ax.set_aspect("equal", adjustable="datalim")
         ax.margins(0.15)
     if names := ax.get_legend_handles_labels()[1]:
-        many = len(names) > 5 and not panel.get("equal")  # they would cover curves
+        many = len(names) > 4 and not panel.get("equal")  # they would cover curves
         beside: dict[str, Any] = {"loc": "upper left", "bbox_to_anchor": (1.0, 1.0)} if many else {}
         ax.legend(framealpha=0.8, edgecolor="none", fontsize=8, **beside)
     ax.grid(alpha=0.3)
