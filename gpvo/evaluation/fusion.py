@@ -147,7 +147,7 @@ def _why_not(policy: str, constants: Constants | None, predictor: Predictor | No
     if policy == IMPORTED:
         return "the runs hold no covariance stated by their own odometry; gpvo import makes such runs"
     if policy in STATED:
-        return f"the runs hold too few usable covariances; run VO with --methods {policy}"
+        return f"the runs hold too few of its covariances; gpvo run --methods {policy} states them, a log cannot"
     if policy == CONSTANT_BEST:
         return "it is tuned on training runs; give --train RUN"
     if policy == CONSTANT_HINDSIGHT and constants is not None:

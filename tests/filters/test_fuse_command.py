@@ -191,7 +191,9 @@ def test_one_run_has_no_interval(runs: list[Path]) -> None:
     assert "inf" not in out
 
 
-@pytest.mark.parametrize("policy, words", [("constant", "--train RUN"), ("triangulation", "--methods triangulation")])
+@pytest.mark.parametrize(
+    "policy, words", [("constant", "--train RUN"), ("triangulation", "gpvo run --methods triangulation")]
+)
 def test_nothing_to_fuse_with_is_an_error(runs: list[Path], policy: str, words: str) -> None:
     with pytest.raises(GpvoError, match=f"nothing to fuse with: {policy} is left out: .*{words}"):
         _run("fuse", runs[0], "--policies", policy)
