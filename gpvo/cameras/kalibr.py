@@ -173,9 +173,8 @@ def make_lens(
         if len(distortion) < 4 or any(distortion[4:]):
             raise CalibrationError(f"a fisheye needs 4 distortion coefficients, not {len(distortion)}", where=where)
         return KannalaBrandt(fx, fy, cx, cy, width, height, tuple(distortion[:4]))
-    raise CalibrationError(
-        f"distortion model '{distortion_model}' is not supported", where=where, cure="use radtan or equidistant"
-    )
+    cure = "use radtan or equidistant"
+    raise CalibrationError(f"distortion model '{distortion_model}' is not supported", where=where, cure=cure)
 
 
 def _lens(block: dict[str, Any], where: str) -> CameraModel:

@@ -11,7 +11,7 @@ from gpvo.errors import GpvoError, ModelError, SourceError, printable
 from gpvo.geometry.se3 import path_length_m
 from gpvo.io.bag_reader import IMAGE_TYPES, is_bag, open_bag, topics_of
 from gpvo.io.foreign import guess_format, read_foreign
-from gpvo.io.parquet import count_rows
+from gpvo.io.parquet import count_rows, read_blocks
 from gpvo.io.run import read_run
 from gpvo.io.run_read import is_run
 from gpvo.io.source import existing, guess, open_source
@@ -21,7 +21,7 @@ _HEAD = 100_000
 
 
 def describe(path: Path, kind: str | None = None, options: dict[str, Any] | None = None) -> dict[str, Any]:
-    """A document with ``what`` (run, model, sequence, trajectory, calibration or bag) and what is known about it.
+    """A document with ``what`` (run, model, sequence, trajectory, calibration, bag or table) and what is known of it.
 
     ``kind`` treats the path as a sequence of that format, ``options`` go to its source. Raises GpvoError if the path is
     nothing that gpvo knows, or is damaged.
@@ -34,6 +34,8 @@ def describe(path: Path, kind: str | None = None, options: dict[str, Any] | None
             return _run(path)
         if path.suffix.lower() in (".yaml", ".yml"):
             return _calibration(path)
+        if path.suffix.lower() == ".parquet":
+            return {"what": "table", "rows": count_rows(path), "columns": list(next(read_blocks(path), {}))}
         if path.suffix.lower() in (".txt", ".csv", ".tum"):
             return _projections(path) or _trajectory(path)
         if is_bag(path) and guess(path) == "rosbag":

@@ -13,7 +13,7 @@ import typer
 
 from gpvo.cli.common import refuse_twice
 from gpvo.cli.output import Json, cell, numbers, print_json, progress, say, show
-from gpvo.cli.twin import Seed, TwinOptions, Twins, make_all, say_simulated
+from gpvo.cli.twin import TWINS, Seed, TwinOptions, make_all, say_simulated
 from gpvo.errors import GpvoError
 from gpvo.files import in_metres
 from gpvo.io.run import Run, read_run
@@ -66,7 +66,7 @@ def evaluate(
     plots: Annotated[Path | None, "Folder for plots, as PNG and PDF, one set per run."] = None,
     tables: Annotated[Path | None, "Folder for trajectories (TUM, for evo) and tables (CSV, LaTeX)."] = None,
     stated: Annotated[Path | None, "Folder for the stated covariances of each method, as files for gpvo score."] = None,
-    twins: Twins = False,
+    twins: Annotated[bool, f"{TWINS} A run that has truth gets a row 'twin'."] = False,
     twin_options: TwinOptions = TwinOptions(),
     seed: Seed = 1,
     json_: Json = False,
@@ -270,8 +270,8 @@ def _print_methods(d: dict[str, Any]) -> None:
     say("1 s: over a second. coverage [%]: within 1, 2, 3 sigma.")
     say("NLL: nats per axis, as a Gaussian; stated: under the stated density, where it has heavier tails.")
     if noisy:
-        noise = f"{1e3 * sigma['translation_m']:.2g} mm, {1e3 * sigma['rotation_rad']:.2g} mrad per pose and axis"
-        say(f"+truth: with the truth's own noise ({noise}) taken into account, as in column 1 s.")
+        noise = f"{1e3 * sigma['translation_m']:.2g} mm, {1e3 * sigma['rotation_rad']:.2g} mrad per pose"
+        say(f"+truth: with the truth's own noise ({noise}, rms over axes) taken into account, as in column 1 s.")
 
 
 def _print_pooled(pooled: dict[str, Any], runs: int) -> None:
@@ -282,5 +282,7 @@ def _print_pooled(pooled: dict[str, Any], runs: int) -> None:
             cells += [cell(s["mean"]), "-" if s["low"] is None else f"{cell(s['low'])} to {cell(s['high'])}"]
         rows.append(cells)
     if rows:
-        say(f"mean of the {runs} runs" + ("" if runs > 2 else ": too few for an interval"))
+        few = "" if runs > 2 else ": too few for an interval"
+        say(f"mean of the {runs} runs{few}")
+        say("(NEES with the truth's own noise taken into account, NLL without)")
         show(("method", "NLL", "interval", "NEES", "interval"), rows)

@@ -131,7 +131,7 @@ def _frame(log: ForeignLog) -> str:
 
 
 def info(
-    path: Annotated[Path, "Sequence, run folder, trajectory, calibration, bag or model."],
+    path: Annotated[Path, "Sequence, run folder, trajectory, calibration, bag, table or model."],
     kind: options.Kind = None,
     reading: options.SequenceOptions = options.SequenceOptions(),
     json_: Json = False,

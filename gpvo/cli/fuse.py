@@ -48,9 +48,9 @@ def fuse(
     one_of("--init", init, ("truth", "static"))
     one_of("--gate", gate, ("discard", "inflate"))
     if plot is not None:
-        from gpvo.evaluation.plots import plot_fusion, require_picture
+        from gpvo.evaluation import plots
 
-        require_picture(plot)  # before the work, not after it
+        plots.require_picture(plot)  # before the work, not after it
     wanted = tuple(p.strip() for p in policies.split(",") if p.strip())
     settings = FusionSettings(
         policies=wanted,
@@ -75,7 +75,7 @@ def fuse(
     for warning in report.warnings:
         print(f"gpvo: {warning}", file=sys.stderr)
     if plot is not None:
-        plot_fusion(report.traces, plot)
+        plots.save(plots.fusion(report.traces), plot, dpi=120)
     if json_:
         print_json(document(report))
         return

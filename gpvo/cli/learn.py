@@ -96,7 +96,7 @@ def train(
         kept = sum(len(s) for s in trained.sets)
         given = trained.header.get("rows", {}).get("given", kept)
         streamed = f", sampled from {given}" if given > kept else ""
-        print(f"{out}: {kept} rows of {len(trained.sets)} runs{streamed}")
+        print(f"{out}: {kept} rows of {len(trained.sets)} run{'s' * (len(trained.sets) != 1)}{streamed}")
 
 
 def _tell(trained: TrainedModel, settings: dict[str, Any], noisy: list[str]) -> None:
@@ -131,7 +131,8 @@ def _each_once(paths: list[Path], config: TrainConfig, noisy: list[str]) -> Iter
 
     for path in paths:
         run = read_run(path)
-        if run.truth is not None and len(run.truth.t_ns) > 1:
+        # A twin's truth is of the same frames and clock by construction.
+        if run.truth is not None and len(run.truth.t_ns) > 1 and not run.meta.get("twin"):
             truth = aligned_truth(run.log, run.truth, config.align)
             if late_by(run.log, truth) or Misread.of(run.log, truth).grossly:
                 note(

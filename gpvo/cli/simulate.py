@@ -57,6 +57,8 @@ def simulate(
         raise GpvoError("nothing to simulate", cure="gpvo simulate SCENARIO -o OUT, or gpvo simulate --list")
     if out is None and preview is None:
         raise GpvoError("nowhere to write", cure="give -o OUT, or --preview PNG for a look at the images")
+    if preview is not None and preview.suffix.lower() != ".png":
+        raise GpvoError("does not have the suffix of a PNG", where=preview, cure="end it in .png")
     if points and preview:
         raise GpvoError("--points draws no images to preview", cure="leave out one of --points, --preview")
     from gpvo.sim.scenario import fly_campaign, load_scenario, stated_seed, warn_of_unused

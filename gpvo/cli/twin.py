@@ -57,11 +57,8 @@ class TwinOptions:
         return None
 
 
-Twins = Annotated[
-    bool,
-    "For runs without ground truth, use twins: the runs simulated again from their tracks (gpvo run"
-    " --keep-tracks). 'gpvo evaluate' gives a run that has truth a row 'twin'.",
-]
+TWINS = "For runs without ground truth, use twins: the runs simulated again from their tracks (gpvo run --keep-tracks)."
+Twins = Annotated[bool, TWINS]
 Seed = Annotated[
     int, "Random seed of the twins; not that of 'gpvo train', so a model is judged on other twins.", {"min": 0}
 ]
@@ -100,7 +97,7 @@ def twin(
     if json_:
         print_json({"schema": 1, "twins": [str(p) for p in made]})
     else:
-        print(f"{out}: {len(made)} twins of {len(runs)} runs")
+        print(f"{out}: {len(made)} twins of {len(runs)} run{'s' * (len(runs) != 1)}")
 
 
 def _print_ratios(runs: Sequence[Run], twins: Sequence[Sequence[Path]], json_: bool) -> None:

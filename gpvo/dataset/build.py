@@ -129,11 +129,8 @@ def build(
             raise GpvoError(f"unknown treatment of {what}: '{way}'", cure="drop or keep")
     names = tuple(columns or (*resolve("full"), RESIDUAL_COLUMN))
     if truth is None or len(truth.t_ns) < 2:
-        raise GpvoError(
-            "has no ground truth to learn from",
-            where=where or name,
-            cure="run a sequence that has it, or gpvo import --truth",
-        )
+        cure = "run a sequence that has it, gpvo import --truth, or --twins for a run made with --keep-tracks"
+        raise GpvoError("has no ground truth to learn from", where=where or name, cure=cure)
     if target != "position":
         require_attitude(log, truth, where or name)
         _require_one_unit(log, truth, where or name)

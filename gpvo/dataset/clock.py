@@ -91,10 +91,8 @@ def _coarse(log: TruthLog, truth: TruthLog, step_s: float, window_s: float) -> f
         score = np.where(near | (np.minimum.reduce(by_kind) > np.sqrt(1 - unexplained)), score, -1.0)
     best = int(np.argmax(score))
     if score[best] < _MIN_CORRELATION:
-        raise GpvoError(
-            f"the motions of log and truth do not match (correlation {score[best]:.2f})",
-            cure="is it the truth of this log? If so, give --time-offset in seconds",
-        )
+        cure = "is it the truth of this log? If so, give --time-offset in seconds"
+        raise GpvoError(f"the motions of log and truth do not match (correlation {score[best]:.2f})", cure=cure)
     return float(offset[best])
 
 

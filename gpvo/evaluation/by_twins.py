@@ -5,6 +5,7 @@ its errors exceed what a model of its twins predicts."""
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -62,6 +63,7 @@ def by_twins(
     if run.truth is not None:
         own = evaluate_run(run, predictor, options, [statement(run, twins)], misfits)
         return run_document(own), [own]
+    options = replace(options, truth_sigma=options.truth_sigma or (0.0, 0.0))  # simulated truth is exact
     found = [evaluate_run(t, predictor, options, [statement(t, others)], ()) for t, others in leave_one_out(twins)]
     mean = average([run_document(e) for e in found])
     # A verdict is in words, which have no mean: the numbers speak.

@@ -254,7 +254,8 @@ def judged(log: VoLog, predictions: Mapping[int, Prediction]) -> VoLog:
 
 def _truth(run: Run, options: EvaluateOptions) -> tuple[TruthLog, float]:
     if run.truth is None:
-        raise SourceError("has no ground truth", where=run.path, cure="--truth FILE (TUM lines), or --twins")
+        cure = "give --truth FILE, TUM lines, or --twins for a run made with --keep-tracks"
+        raise SourceError("has no ground truth", where=run.path, cure=cure)
     truth, offset_s = run.truth, options.time_offset_s
     if offset_s is None:
         offset_s = estimate_time_offset(run.log, truth)

@@ -44,11 +44,12 @@ class FusionSettings:
 
 @dataclass(frozen=True)
 class Trace:
-    """What a plot needs of one run under one policy; errors NaN without truth."""
+    """What a plot needs of one run under one policy; errors NaN without truth. ``T_world_first``: its first pose."""
 
     run: str
     policy: str
     t_s: Array
+    T_world_first: Array
     position: Array
     truth: Array | None
     error_m: Array
@@ -93,6 +94,9 @@ def fuse_runs(
         warnings += _findings(run, flights[-1], options)
         if (stating := predictor or predictor_of(run)) is not None:
             warnings += [f"{name}: the model does not fit: {problem}" for problem in check(stating, run).problems]
+    if settings.use_imu and (without := [f.name for f in flights if f.imu is None]):
+        which = "any run" if len(without) == len(flights) else ", ".join(without)
+        warnings.append(f"no IMU in {which}: a model of constant velocity stands in for it")
     constants = _constants(settings, predictor, flights, options, tell)
     learned = any(f.predictions for f in flights)
     policies = make_policies(constants, names=settings.policies, learned=learned)
@@ -143,7 +147,7 @@ def _why_not(policy: str, constants: Constants | None, predictor: Predictor | No
     if policy == IMPORTED:
         return "the runs hold no covariance stated by their own odometry; gpvo import makes such runs"
     if policy in STATED:
-        return f"the runs hold too few usable covariances; run VO with --methods {policy}"
+        return f"the runs hold too few of its covariances; gpvo run --methods {policy} states them, a log cannot"
     if policy == CONSTANT_BEST:
         return "it is tuned on training runs; give --train RUN"
     if policy == CONSTANT_HINDSIGHT and constants is not None:
@@ -186,6 +190,7 @@ def trace_of(flight: Flight, fused: FusedRun) -> Trace:
         run=flight.name,
         policy=fused.policy,
         t_s=(fused.t_ns - fused.t_ns[0]) * 1e-9,
+        T_world_first=fused.T_world_cam[0],
         position=position,
         truth=truth,
         error_m=error,

@@ -287,7 +287,7 @@ GROUPS: dict[tuple[str, str], tuple[Drawing, ...]] = {
         "Is it honest?",
         "Overconfident where the curve is below the diagonal, and where NEES (mean over 0.5 s) is above 1.",
     ): (
-        Drawing(reliability, "reliability", "stated probability, and share inside", (5.5, 5)),
+        Drawing(reliability, "reliability", "stated probability, and share inside", (7.5, 5)),
         Drawing(nees, "nees", "1 is right, above 1 is overconfident", (10, 3.5)),
     ),
     (

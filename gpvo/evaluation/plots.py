@@ -19,7 +19,7 @@ from gpvo.evaluation.evaluate import Evaluation
 from gpvo.evaluation.forecast import Forecast
 from gpvo.evaluation.fusion import Trace, nis_band, nis_over_runs
 from gpvo.evaluation.panels import Drawing, Panel, colour, line
-from gpvo.files import replacing
+from gpvo.files import make_folder, replacing
 
 
 def picture(e: Evaluation, of: Drawing) -> Figure:
@@ -66,8 +66,10 @@ def _draw(ax: Axes, panel: Panel) -> None:
     if panel.get("equal"):
         ax.set_aspect("equal", adjustable="datalim")
         ax.margins(0.15)
-    if ax.get_legend_handles_labels()[0]:
-        ax.legend(framealpha=0.8, edgecolor="none", fontsize=8)
+    if names := ax.get_legend_handles_labels()[1]:
+        many = len(names) > 4 and not panel.get("equal")  # they would cover curves
+        beside: dict[str, Any] = {"loc": "upper left", "bbox_to_anchor": (1.0, 1.0)} if many else {}
+        ax.legend(framealpha=0.8, edgecolor="none", fontsize=8, **beside)
     ax.grid(alpha=0.3)
 
 
@@ -78,7 +80,6 @@ FIGURES: dict[str, Callable[[Evaluation], Figure]] = {
 
 def save_all(e: Evaluation, folder: Path, name: str | None = None) -> list[Path]:
     """Every figure of a run as ``<name>_<figure>.png`` and ``.pdf``; ``name``: by default the run's."""
-    folder.mkdir(parents=True, exist_ok=True)
     out = []
     for figure, draw in FIGURES.items():
         drawn, path = draw(e), folder / f"{name or e.run.name}_{figure}.png"
@@ -117,24 +118,26 @@ def require_picture(path: Path) -> None:
         raise GpvoError("does not have the suffix of an image", where=path, cure=f"choose from {', '.join(known)}")
 
 
-def plot_fusion(traces: Sequence[Trace], path: Path) -> None:
-    """Draw the first run's path and errors and all runs' innovations to an image file, one colour per policy."""
+def fusion(traces: Sequence[Trace]) -> Figure:
+    """Of filters, one colour per policy: the first run's path from above, its errors, and all runs' innovations."""
     first = [t for t in traces if t.run == traces[0].run]
     paths, errors = [], []
+    to_plane, names = panels.level(first[0].T_world_first if first else np.eye(4))
     if first and first[0].truth is not None:
-        paths.append(line(first[0].truth[:, 0], first[0].truth[:, 1], "truth", "black", 2.0))
+        x, y, _ = to_plane @ first[0].truth.T
+        paths.append(line(x, y, "truth", "black", 2.0))
     for t in first:
-        paths.append(line(t.position[:, 0], t.position[:, 1], t.policy, colour(t.policy), 1.0))
+        x, y, _ = to_plane @ t.position.T
+        paths.append(line(x, y, t.policy, colour(t.policy), 1.0))
         errors.append(line(t.t_s, t.error_m, t.policy, colour(t.policy), 1.0))
         errors.append({**line(t.t_s, 3 * t.sigma_m, "", colour(t.policy), 0.7), "dash": True})
     about = "error, and three sigma of the filter's own (dashed)"
     drawn = (
-        panels.panel(first[0].run if first else "", "x [m]", "y [m]", paths, equal=True),
+        panels.panel(first[0].run if first else "", f"{names[0]} [m]", f"{names[1]} [m]", paths, equal=True),
         panels.panel(about, "time [s]", "position error [m]", errors),
         _innovations(traces),
     )
-    path.parent.mkdir(parents=True, exist_ok=True)
-    save(figure_of(drawn, (11, 9)), path, dpi=120, bbox_inches="tight")
+    return figure_of(drawn, (11, 9))
 
 
 def _innovations(traces: Sequence[Trace]) -> Panel:
@@ -148,11 +151,12 @@ def _innovations(traces: Sequence[Trace]) -> Panel:
         low, high = nis_band(runs)
         reach = [0.0, max(t.t_s[-1] for t in traces)]
         bands.append({"x": reach, "low": [low, low], "high": [high, high], "colour": "grey"})
-    title = f"innovations, mean over {runs} run(s), with the 95 % chi-square band"
+    title = f"innovations, mean over {runs} run{'s' * (runs != 1)}, with the 95 % chi-square band"
     return panels.panel(title, "time [s]", "NIS / 6", lines, bands=bands, log="y")
 
 
 def save(figure: Figure, path: Path, **options: Any) -> None:
     """Write to an image file, whole or not at all; ``options``: of matplotlib's ``savefig``."""
+    make_folder(path.parent)
     with replacing(path) as temporary:
         figure.savefig(temporary, format=path.suffix[1:].lower(), **options)

@@ -89,9 +89,9 @@ def _of_others(e: Evaluation) -> Verdict:
             " rigid alignment of all, which moves the first poses of a drifting odometry by more than they state."
         )
         return Verdict(colour, f"The covariance of the poses is {_word(joint)}.", (*_conditions(e), line))
-    cure = "gpvo train learns one from such runs; give the model with --model."
     headline = "No covariance was stated, so nothing can be judged."
-    return Verdict("red", headline, (*_conditions(e), cure), judged=False)
+    cure = "gpvo train learns one from such runs; give the model with --model."
+    return Verdict("red", headline, (cure, *_conditions(e)), judged=False)
 
 
 def _of_motions(e: Evaluation, judged: Mapping[str, Consistency]) -> Verdict:
@@ -235,8 +235,8 @@ def _conditions(e: Evaluation) -> Iterator[str]:
     if (e.truth_sigma > 1.5 * e.truth_sigma_stated).any():
         stated = _up_to(e.truth_sigma_stated) or "none"
         yield (
-            f"The truth itself has an estimated noise of {_up_to(e.truth_sigma)} per pose (its source states {stated})."
-            " This is taken into account."
+            f"The truth itself has an estimated noise of {_up_to(e.truth_sigma)} per pose on its worst axis (its source"
+            f" states {stated}). This is taken into account."
         )
     if not e.covered.any():
         yield "gpvo evaluate --twins judges a run by its twins, if it was made with --keep-tracks."

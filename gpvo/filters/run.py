@@ -25,6 +25,7 @@ T = TypeVar("T")
 
 # Truth whose vertical is measured further than this from +z, in sigmas, is in another frame: gravity is as measured.
 _LEVEL_SIGMAS = 3.0
+_NO_TRUTH = "use --twins for a run with tracks, gpvo import --truth for a log"
 _SHORTEST_PATH_M = 0.1  # of which a drift is a part
 _IMU_MARGIN_NS = 100_000_000  # that an IMU log begins after or ends before the images is usual
 
@@ -123,13 +124,13 @@ def begin(flight: Flight, options: FuseOptions) -> tuple[Start, Array | None]:
     t_ns = VoLog(flight.records).t_ns[valid]
     if options.init == "static":
         if flight.imu is None:
-            cure = "use --init truth" if flight.has_truth else "use --twins"
+            cure = "use --init truth" if flight.has_truth else _NO_TRUTH
             raise GpvoError("a static start needs an IMU", where=flight.name, cure=cure)
         if not flight.has_truth:
             return from_rest(flight.imu, flight.records[flight.first].t_ns, sigmas), None
     elif not flight.has_truth:
-        cure = "use --twins" if flight.imu is None else "use --twins or --init static"
-        raise GpvoError("--init truth needs ground truth for the frames", where=flight.name, cure=cure)
+        cure = _NO_TRUTH if flight.imu is None else f"{_NO_TRUTH}, or --init static"
+        raise GpvoError("--init truth needs ground truth", where=flight.name, cure=cure)
     elif len(valid) < 2:
         raise GpvoError("ground truth covers fewer than two frames", where=flight.name, cure="use --init static")
     T = flight.T_world_imu[valid]

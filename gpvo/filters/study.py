@@ -198,7 +198,7 @@ def table(study: Study) -> str:
     if len(study.runs) == 1:
         return "\n".join(lines)
     runs = ", ".join(f"{i + 1}: {run}" for i, run in enumerate(study.runs))
-    lines += ["", *textwrap.wrap(f"ATE m on {runs}", 80)]
+    lines += ["", *textwrap.wrap(f"ATE m on {runs}", 80, break_on_hyphens=False)]
     for begin in range(0, len(study.runs), 6):
         some = range(begin, min(begin + 6, len(study.runs)))
         lines.append(" " * 20 + "".join(f"{i + 1:>10}" for i in some))

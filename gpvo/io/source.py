@@ -155,9 +155,8 @@ def guess(path: str | Path) -> str:
         if load().recognises(p):
             return name
     if (p / "run.json").is_file():
-        raise SourceError(
-            "is a run, not a sequence", where=p, cure="gpvo evaluate, train and fuse take runs as they are"
-        )
+        cure = "gpvo evaluate, train and fuse take runs as they are"
+        raise SourceError("is a run, not a sequence", where=p, cure=cure)
     if runs := sorted(inside.parent.name for inside in p.glob("*/run.json")):
         more = f" and {len(runs) - 3} more" if len(runs) > 3 else ""
         raise SourceError(f"holds runs, not a sequence: {', '.join(runs[:3])}{more}", where=p, cure="give one of them")

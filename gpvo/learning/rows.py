@@ -32,11 +32,8 @@ def checked(sets: Sequence[TrainingSet], target: str) -> list[TrainingSet]:
         raise GpvoError("there is no run to train on", cure="gpvo train RUN... -o MODEL")
     other = next((s for s in sets if s.target != target), None)
     if other is not None:
-        raise GpvoError(
-            f"holds rows of the target '{other.target}', not '{target}'",
-            where=other.name,
-            cure=f"--target {other.target}",
-        )
+        cure = f"--target {other.target}"
+        raise GpvoError(f"holds rows of the target '{other.target}', not '{target}'", where=other.name, cure=cure)
     names = [s.name for s in sets]
     if len(set(names)) < len(names):
         sets = [replace(s, name=f"{s.name}#{i}") if names.count(s.name) > 1 else s for i, s in enumerate(sets)]

@@ -65,9 +65,8 @@ def training_rows(path: str | Path) -> list[TrainingSet]:
     path = Path(path)
     header = modelfile.load(path)[1]
     if not rows_path(path).is_file():
-        raise ModelError(
-            "the training rows are not beside the model", where=rows_path(path), cure="train again from all runs"
-        )
+        cure = "train again from all runs"
+        raise ModelError("the training rows are not beside the model", where=rows_path(path), cure=cure)
     sets = read_sets(rows_path(path))
     if training_digest(sets) != header.get("training_digest"):
         raise ModelError("holds rows of another model", where=rows_path(path), cure="train again from all runs")

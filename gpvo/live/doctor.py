@@ -43,7 +43,8 @@ _DEPTH = 10_000  # messages of a live topic that may wait
 def examine_bag(path: Path, topic: str | None = None) -> dict[str, list[Finding]]:
     """Findings of a topic, or of every topic that holds poses. SourceError for what is no bag, or has no such topic."""
     if not path.exists() or not is_bag(path):
-        raise SourceError("is not a bag", where=path, cure=f"for a running topic add --{', --'.join(WIRES)}")
+        what = "is not a bag" if path.exists() else "no such bag"
+        raise SourceError(what, where=path, cure=f"for a running topic add --{', --'.join(WIRES)}")
     with open_bag(path) as reader:
         found = list(topics_of(reader, POSE_TYPES))
         if not found:

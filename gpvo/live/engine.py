@@ -277,7 +277,10 @@ class Engine:
             out += rate_problems(self.predictor, self._motions)
         if len(self._inside) >= 20 and np.mean(self._inside) < 0.5:
             share = 100 * float(np.mean(self._inside))
-            out.append(f"only {share:.0f} % of the last motions lie inside the model's training domain")
+            given = {i.feature for i in self.predictor.explain() if np.isfinite(i.value)}
+            absent = [name for name in self.predictor.features if name not in given]
+            why = f": the input lacks {', '.join(absent)} (is the model of this odometry?)" if absent else ""
+            out.append(f"only {share:.0f} % of the last motions lie inside the model's training domain{why}")
         return out + self.stage.problems()
 
     def _warn(self, text: str) -> None:

@@ -234,10 +234,8 @@ class FeatureStream:
             if picked:
                 self._pick.append((group.start(camera), picked))
         if unknown := set(self.names) - known_columns().keys():
-            raise GpvoError(
-                f"features that are needed are not installed: {', '.join(sorted(unknown))}",
-                cure="install the package that defines them, or update gpvo",
-            )
+            cure = "install the package that defines them, or update gpvo"
+            raise GpvoError(f"features that are needed are not installed: {', '.join(sorted(unknown))}", cure=cure)
 
     def step(self, record: VoRecord) -> Array:
         """(d,) features of the record's motion. Call once per record, in time order."""

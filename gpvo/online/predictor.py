@@ -58,10 +58,8 @@ class Predictor:
         # Arrays whose meaning this version does not know are refused; arrays it does not know are ignored.
         modelfile.check_version("model schema", header.get("model_schema", MODEL_SCHEMA), MODEL_SCHEMA)
         if header.get("target") == "position":
-            raise ModelError(
-                "this model predicts the residual of a position, not the error of a motion",
-                cure="use ThesisModel.of_positions, or train with --target frame",
-            )
+            cure = "use ThesisModel.of_positions, or train with --target frame"
+            raise ModelError("this model predicts the residual of a position, not the error of a motion", cure=cure)
         self.header, self.digest, self.arrays = dict(header), digest, dict(arrays)
         try:
             self.features = tuple(header["features"])

@@ -51,7 +51,7 @@ class Verdict:
 
     quantity: str
     parameter: str
-    value: float
+    value: float | None  # None where what hides the covariance is no number
     hidden_percent: float
     predicted: tuple[float, float, float]  # 5th, 50th and 95th percentile of the predicted sigma
     unit: str
@@ -59,9 +59,10 @@ class Verdict:
 
     def __str__(self) -> str:
         low, middle, high = self.predicted
+        value = "" if self.value is None else f" = {self.value:g}"
         line = (
             f"{self.quantity}: predicted sigma {low:.3g} / {middle:.3g} / {high:.3g} {self.unit} (5, 50, 95 %); "
-            f"{self.parameter} = {self.value:g} hides it in {self.hidden_percent:.0f} % of frames"
+            f"{self.parameter}{value} hides it in {self.hidden_percent:.0f} % of frames"
         )
         return line + (f". {self.advice}" if self.advice else "")
 
@@ -113,9 +114,9 @@ def _check_fusioncore(pose: Array, twist: Array) -> list[Verdict]:
     ):
         hidden = np.linalg.eigvalsh(C / (sigma[:, :, None] * sigma[:, None, :]))[:, 0] < 0.25
         predicted = _percentiles(np.sqrt(variances(C)).min(axis=1))
-        gate = "its chi-square gate is only as good as these sigmas; send no zeros"
-        advice = f"It reads {reads}, by the diagonal alone, and {gate}"
-        out.append(Verdict(quantity, "diagonal only", 0.0, 100.0 * float(hidden.mean()), predicted, unit, advice))
+        advice = f"It reads {reads}, and its chi-square gate is only as good as these sigmas; send no zeros"
+        percent, cause = 100.0 * float(hidden.mean()), "use of the diagonal alone"
+        out.append(Verdict(quantity, cause, None, percent, predicted, unit, advice))
     return out
 
 
@@ -168,5 +169,5 @@ def _verdict(
     if hidden > 1.0 and floor is None and wanted < value:
         advice = f"Set {name} to {max(wanted, minimum):.2g}"
         if wanted < minimum:
-            advice += f", the smallest it accepts; a sigma of {wanted:.2g} {unit} stays hidden"
+            advice += f", the smallest it accepts, which hides {100 * float((sigma < minimum).mean()):.0f} %"
     return Verdict(quantity, name, value, hidden, predicted, unit, advice)

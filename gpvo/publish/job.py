@@ -105,9 +105,8 @@ def _target(settings: PublishSettings) -> str | None:
     GpvoError where they contradict each other, or its suffix tells nothing."""
     told = None if settings.out is None else _SUFFIXES.get(settings.out.suffix.lower())
     if settings.to in TARGETS and told not in (None, settings.to):
-        raise GpvoError(
-            f"is not a file name for --to {settings.to}", where=settings.out, cure=f"use --to {told}, or another -o"
-        )
+        cure = f"use --to {told}, or another -o"
+        raise GpvoError(f"is not a file name for --to {settings.to}", where=settings.out, cure=cure)
     if settings.out is not None and settings.out.suffix and not (settings.to or told):
         cure = f"end it in {', '.join(_SUFFIXES)}, or say with --to what to write"
         raise GpvoError("its suffix does not tell what to write", where=settings.out, cure=cure)

@@ -12,7 +12,7 @@ from gpvo.errors import GpvoError
 from gpvo.geometry import se3
 from gpvo.geometry.covariance import is_positive_definite, lost_covariance, symmetrise
 from gpvo.geometry.se3 import R_FLU_OPTICAL, rotate_covariance
-from gpvo.types import Array, MotionError, Prediction, Status, VoRecord
+from gpvo.types import IMPORTED_POSE, Array, MotionError, Prediction, Status, VoRecord
 
 
 @dataclass(frozen=True)
@@ -128,11 +128,13 @@ class OdometryBuilder:
             if not is_positive_definite(prediction.covariance):
                 raise GpvoError(f"the prediction at t_ns {record.t_ns} is not symmetric positive definite")
             return prediction
-        covariance = record.covariances.get(self.method or "")
+        of_motions = {m: C for m, C in record.covariances.items() if m != IMPORTED_POSE}
+        covariance = of_motions.get(self.method or "")
         if covariance is None or not is_positive_definite(covariance):
             raise GpvoError(
-                f"the frame at t_ns {record.t_ns} has neither a prediction nor a '{self.method}' covariance",
-                cure=f"give --model, or --method with one of {', '.join(record.covariances) or 'what the run holds'}",
+                f"the frame at t_ns {record.t_ns} has neither a prediction nor a covariance of its motion"
+                f" '{self.method}'",
+                cure=" or ".join(["give --model", *(f"--method {m}" for m in of_motions)]),
             )
         return MotionError.independent(covariance, dt_s=record.dt_s)
 

@@ -73,11 +73,8 @@ def read_recording(file: Path, duration_s: float, rest_s: float = 3.0) -> Record
     clock, T_world_body = _read(file)
     needed = float(smooth_start(np.array([duration_s]), rest_s)[0])
     if clock[-1] < needed:
-        raise SourceError(
-            f"lasts {clock[-1]:.1f} s, the flight needs {needed:.1f} s of it",
-            where=file,
-            cure=f"a duration of at most {longest_flight_s(clock[-1], rest_s):g} s",
-        )
+        cure = f"a duration of at most {longest_flight_s(clock[-1], rest_s):g} s"
+        raise SourceError(f"lasts {clock[-1]:.1f} s, the flight needs {needed:.1f} s of it", where=file, cure=cure)
     grid = np.arange(0.0, needed + 0.3, _STEP_S)
     poses = _resample(clock, T_world_body, np.minimum(grid, clock[-1]))
     p, turned = _smoothed(poses[:, :3, 3], poses[:, :3, :3] @ poses[0, :3, :3].T)

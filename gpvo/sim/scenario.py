@@ -214,11 +214,8 @@ def _validated(table: dict[str, Any], where: object) -> Scenario:
         raise GpvoError(f"unknown parameter 'points.{unknown[0]}'", where=where, cure=_nearest(unknown[0], known))
     check_values(scenario.points, "points.")
     if scenario.camera not in CAMERAS and not Path(scenario.camera).exists():
-        raise GpvoError(
-            f"camera is '{scenario.camera}'",
-            where=where,
-            cure=f"choose from {', '.join(CAMERAS)}, or give a Kalibr, OpenCV, ROS or KITTI file, or a run",
-        )
+        cure = f"choose from {', '.join(CAMERAS)}, or give a Kalibr, OpenCV, ROS or KITTI file, or a run"
+        raise GpvoError(f"camera is '{scenario.camera}'", where=where, cure=cure)
     if scenario.path == "waypoints" and len(scenario.waypoints) < 2:
         raise GpvoError("path = waypoints needs at least two places", where=where, cure="waypoints = [[x, y, z], ...]")
     # Frames lie on whole milliseconds: the shortest time between two.

@@ -24,7 +24,7 @@ from numpy.typing import NDArray
 from gpvo.cameras.models import CameraModel
 from gpvo.cameras.rig import StereoRig
 from gpvo.errors import GpvoError, OutputError
-from gpvo.files import FolderLock, make_folder, to_toml, write_json
+from gpvo.files import FolderLock, make_folder, replacing, to_toml, write_json
 from gpvo.geometry import se3
 from gpvo.geometry.se3 import path_length_m
 from gpvo.io.images import read_grey8
@@ -312,5 +312,6 @@ def contact_sheet(sequence: Path, out: Path) -> None:
             small.append(cv2.resize(image, (_WIDTH_PX, round(image.shape[0] * _WIDTH_PX / image.shape[1]))))
         tiles.append(np.pad(np.hstack(small), 2, constant_values=255))
     sheet = np.vstack([np.hstack(tiles[k : k + 2]) for k in (0, 2, 4)])
-    out.parent.mkdir(parents=True, exist_ok=True)
-    out.write_bytes(cv2.imencode(".png", sheet)[1].tobytes())
+    make_folder(out.parent)
+    with replacing(out) as temporary:
+        temporary.write_bytes(cv2.imencode(".png", sheet)[1].tobytes())

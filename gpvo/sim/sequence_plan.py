@@ -82,10 +82,8 @@ def refuse_outside(world: World, position_m: Array, t_s: Array, flat: bool = Fal
     outside = ((p < low) | (p > high)).any(axis=1)
     if outside.any():
         k = int(outside.argmax())
-        raise GpvoError(
-            f"the path leaves the world at t = {t_s[k]:.1f} s, place {place(position_m[k])}",
-            cure="a shorter duration, a lower speed, or a larger world",
-        )
+        cure = "a shorter duration, a lower speed, or a larger world"
+        raise GpvoError(f"the path leaves the world at t = {t_s[k]:.1f} s, place {place(position_m[k])}", cure=cure)
 
 
 def _times(scenario: Scenario) -> Array:

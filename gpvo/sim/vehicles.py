@@ -173,9 +173,8 @@ def _wheel_speeds(data: Any, target: Array, pace: Array, heading: float) -> Arra
     off = target - data.qpos[:2]
     if off @ off > _LOST_M**2 or R[2, 2] < _TIPPED:
         what = "tips over" if R[2, 2] < _TIPPED else "loses its path"
-        raise GpvoError(
-            f"the rover {what} after {data.time - _SETTLE_S:.1f} s", cure="a lower speed, or another --seed"
-        )
+        cure = "a lower speed, or another --seed"
+        raise GpvoError(f"the rover {what} after {data.time - _SETTLE_S:.1f} s", cure=cure)
     along, left = np.array([np.cos(heading), np.sin(heading)]), np.array([-np.sin(heading), np.cos(heading)])
     turn = heading - np.arctan2(R[1, 0], R[0, 0])
     turn = np.arctan2(np.sin(turn), np.cos(turn))

@@ -93,7 +93,7 @@ def simulated_truth(metas: Sequence[Mapping[str, Any]]) -> list[dict[str, Any]]:
     """Which of some runs, by their ``run.json``, are twins: of what, how many, with which tolerance."""
     found: dict[str, dict[str, Any]] = {}
     for about in (m["twin"] for m in metas if m.get("twin")):
-        kept = {k: about[k] for k in ("of", "tolerance_name", "tolerance", "gap")}
+        kept = {k: about.get(k) for k in ("of", "tolerance_name", "tolerance", "gap")}
         key = json.dumps(kept)
         kept["seed"] = about["seed"]
         found.setdefault(key, {**kept, "twins": 0})["twins"] += 1

@@ -130,10 +130,8 @@ def own_frame(frame: StereoFrame | TrackFrame, camera: StereoCamera, t_last_ns: 
         cure = "give whole nanoseconds: round(1e9 * seconds)"
         raise SourceError(f"the frame's t_ns is {frame.t_ns!r}, no whole number", cure=cure)
     if t_last_ns is not None and frame.t_ns <= t_last_ns:
-        raise SourceError(
-            f"frame at t_ns={frame.t_ns} is not later than the one before ({t_last_ns})",
-            cure="feed frames in time order",
-        )
+        cure = "feed frames in time order"
+        raise SourceError(f"frame at t_ns={frame.t_ns} is not later than the one before ({t_last_ns})", cure=cure)
     if isinstance(frame, TrackFrame):
         return replace(frame, t_ns=int(frame.t_ns))
     for side, image in (("left", frame.left), ("right", frame.right)):

@@ -206,6 +206,7 @@ def test_several_runs_are_predicted_and_judged_together(tmp_path: Path):
     assert "is part of a run" in refused.stderr
     told = call("evaluate", *runs).stdout
     assert "mean of the 3 runs" in told
+    assert "NEES with the truth's own noise taken into account, NLL without" in told
     two = call("evaluate", *runs[:2]).stdout
     assert "mean of the 2 runs: too few for an interval" in two
 

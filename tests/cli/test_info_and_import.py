@@ -87,10 +87,14 @@ def test_info_of_other_files(gpvo, tmp_path):
         ("camchain.yaml", "calibration"),
         ("s/calib.txt", "calibration"),
         ("run", "run"),
+        ("run/vo_log.parquet", "table"),
     ):
         code, out, _ = gpvo("info", tmp_path / name, "--json")
         assert code == 0
         assert json.loads(out)["what"] == what
+    table = json.loads(gpvo("info", tmp_path / "run" / "vo_log.parquet", "--json")[1])
+    assert table["rows"] == 2
+    assert table["columns"][:2] == ["t_ns", "t_prev_ns"]
     assert "baseline_m: P0 P1 0.1, P2 P3 0.1" in gpvo("info", tmp_path / "s" / "calib.txt")[1]
 
 
@@ -111,7 +115,9 @@ def test_info_of_a_bag(gpvo, tmp_path):
     assert "    /imu0: type sensor_msgs/msg/Imu, messages 1\n" in gpvo("info", tmp_path / "b")[1]
 
 
-@pytest.mark.parametrize("what", ["nothing", "empty", "rubbish.txt", "rubbish.bag", "rubbish.npz", "rubbish.yaml"])
+@pytest.mark.parametrize(
+    "what", ["nothing", "empty", "rubbish.txt", "rubbish.bag", "rubbish.npz", "rubbish.yaml", "a.parquet"]
+)
 def test_info_of_what_is_not_known(gpvo, tmp_path, what):
     path = tmp_path / what
     if what == "empty":

@@ -231,6 +231,7 @@ def test_evaluate_says_so_and_counts_it_in(flights):
     assert 0.025 < found.truth_sigma[:3].mean() < 0.035
     lines = " ".join(verdict(found).lines)
     assert "The truth itself has an estimated noise of 3" in lines
+    assert "on its worst axis" in lines  # the table gives the mean of the axes
     assert "its source states none" in lines
     assert "outweighs the odometry's errors on this run" in lines
     c, clean = (evaluate_run(r).consistency["triangulation"] for r in (run, flights[4]))

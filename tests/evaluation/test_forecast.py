@@ -128,6 +128,9 @@ def test_document_table_picture_and_frames(capsys, tmp_path, model_file):
         assert table.num_rows == 61
         assert table["sigma_m"][60].as_py() == pytest.approx(document["predicted_final_error_m"], rel=1e-9)
     assert picture.read_bytes().startswith(b"\x89PNG")
+    picture = tmp_path / "pictures" / "plan.pdf"
+    assert _main(capsys, model_file, "--path", tmp_path / "cam.tum", "--plot", picture)[0] == 0
+    assert picture.read_bytes().startswith(b"%PDF")
     assert not list(tmp_path.glob("*.part"))
 
 
@@ -140,6 +143,7 @@ def test_what_cannot_be_forecast_is_one_line(capsys, tmp_path, model_file):
         (("--path", tmp_path / "plan.tum", "--frame", "imu"), "imu"),
         (("--path", tmp_path / "plan.tum", "-o", tmp_path / "x.txt"), "x.txt"),
         (("--path", tmp_path / "plan.tum", "-o", tmp_path / "no" / "x.csv"), "x.csv"),
+        (("--path", tmp_path / "none.tum", "--plot", tmp_path / "x.txt"), "not have the suffix of an image"),
     ]
     for args, says in cases:
         code, out, err = _main(capsys, model_file, *args)

@@ -15,7 +15,9 @@ from gpvo.errors import SourceError
 from gpvo.evaluation import panels, plots
 from gpvo.evaluation.document import document
 from gpvo.evaluation.evaluate import Evaluation, evaluate_run, unjudged_run
+from gpvo.evaluation.fusion import Trace
 from gpvo.evaluation.report import render, scene, write_report
+from gpvo.geometry import se3
 from gpvo.io.run import Run, read_run, write_run
 from gpvo.types import Mounting, Status, VoLog, VoRecord
 from matplotlib.figure import Figure
@@ -71,6 +73,32 @@ def test_pictures_are_saved(evaluation, tmp_path):
     saved = plots.save_all(evaluation, tmp_path / "pictures")
     assert len(saved) == len(plots.FIGURES)
     assert all(path.read_bytes().startswith(b"\x89PNG") for path in saved)
+
+
+def test_many_names_stand_beside_their_curves(evaluation):
+    figure = plots.FIGURES["memory"](evaluation)
+    figure.draw_without_rendering()
+    for ax in figure.axes:
+        assert ax.get_legend().get_window_extent().x0 >= ax.get_window_extent().x1
+
+
+def _trace(world: np.ndarray) -> Trace:
+    """Half a circle of 10 m, level, flown by a camera that looks ahead and knows its world turned by ``world``."""
+    a = np.linspace(0.0, np.pi, 50)
+    flat = 10.0 * np.column_stack([np.sin(a), 1.0 - np.cos(a), np.zeros_like(a)])
+    T = se3.from_rt(world @ se3.R_FLU_OPTICAL, np.zeros(3))
+    return Trace("flight", "learned", a, T, flat @ world.T, 1.01 * flat @ world.T, 0 * a, 0 * a, 1 + a)
+
+
+def test_the_path_of_a_filter_is_seen_from_above_in_the_world_of_a_camera_too():
+    """KITTI's world is its first camera's, y down: x and y of it are a view along the road."""
+    drawn = []
+    for world in (np.eye(3), se3.R_FLU_OPTICAL.T):
+        ax = plots.fusion([_trace(world)]).axes[0]
+        drawn.append([entry.get_xydata() for entry in ax.get_lines()])
+        assert ("forward z" in ax.get_xlabel()) == (world[0, 0] == 0)
+    np.testing.assert_allclose(drawn[0], drawn[1], atol=1e-9)
+    assert np.ptp(drawn[1][0], axis=0) == pytest.approx([10.1, 20.2], rel=2e-2)
 
 
 def test_the_page_stands_alone(page):

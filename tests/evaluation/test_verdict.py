@@ -110,6 +110,15 @@ def test_the_method_that_is_true_is_named() -> None:
     assert any(line.startswith("triangulation: overconfident") for line in found.lines)
 
 
+def test_where_nothing_is_stated_the_cure_comes_first() -> None:
+    log, truth = make_run(600)
+    bare = VoLog([replace(r, v_t={}, covariances={}) for r in log], log.camera)
+    evaluation = evaluate_run(Run(Path("hall"), "hall", bare, truth, None, Mounting(), []))
+    found = verdict(replace(evaluation, in_domain=0.5))
+    assert found.headline.startswith("No covariance was stated")
+    assert found.lines[0].startswith("gpvo train learns one")
+
+
 def test_outside_the_domain_is_never_green() -> None:
     found = verdict(replace(evaluated({"triangulation": 1.0}), in_domain=0.1))
     assert found.colour == "red"

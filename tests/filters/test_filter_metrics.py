@@ -75,7 +75,9 @@ def test_tuned_scalars_find_the_noise_they_were_made_with() -> None:
 
 def test_study_tells_a_better_policy_and_leaves_out_what_cannot_run() -> None:
     law = ErrorLaw(burst_factor=10.0)
-    flights = [synthetic_flight(s, duration_s=8, imu_hz=50, law=law) for s in range(6)]
+    flights = [
+        replace(synthetic_flight(s, duration_s=8, imu_hz=50, law=law), name=f"my-last-flight-twin{s}") for s in range(6)
+    ]
     square = np.mean([np.diagonal(p.covariance) for f in flights for p in f.predictions.values()], axis=0)
     names = ("constant", "constant_best", "triangulation", "learned")
     policies = make_policies(Constants(square, 0.05), names=names, learned=True)

@@ -191,7 +191,9 @@ def test_one_run_has_no_interval(runs: list[Path]) -> None:
     assert "inf" not in out
 
 
-@pytest.mark.parametrize("policy, words", [("constant", "--train RUN"), ("triangulation", "--methods triangulation")])
+@pytest.mark.parametrize(
+    "policy, words", [("constant", "--train RUN"), ("triangulation", "gpvo run --methods triangulation")]
+)
 def test_nothing_to_fuse_with_is_an_error(runs: list[Path], policy: str, words: str) -> None:
     with pytest.raises(GpvoError, match=f"nothing to fuse with: {policy} is left out: .*{words}"):
         _run("fuse", runs[0], "--policies", policy)
@@ -258,6 +260,17 @@ def test_a_run_whose_imu_log_is_elsewhere_in_time(tmp_path: Path) -> None:
     write_run(tmp_path / "late", VoLog(flight.records), mounting=MOUNTING, truth=truth, imu=imu)
     with pytest.raises(GpvoError, match="do not overlap"):
         _run("fuse", tmp_path / "late")
+
+
+def test_a_filter_without_an_imu_says_so(runs: list[Path], tmp_path: Path) -> None:
+    run = read_run(runs[0])
+    write_run(tmp_path / "bare", run.log, mounting=run.mounting, truth=run.truth)
+    settings = FusionSettings(policies=("pointing_matching",))
+    for flown, names in (((runs[0],), ""), ((runs[0], tmp_path / "bare"), "bare"), ((tmp_path / "bare",), "any run")):
+        told = [line for line in fuse_runs(flown, settings).warnings if "no IMU" in line]
+        assert told == [f"no IMU in {names}: a model of constant velocity stands in for it"] * bool(names)
+    asked = replace(settings, use_imu=False)
+    assert not any("no IMU" in line for line in fuse_runs([runs[0]], asked).warnings)
 
 
 def test_truth_where_there_is_no_imu_is_no_truth(tmp_path: Path) -> None:

@@ -15,7 +15,7 @@ from gpvo.errors import GpvoError
 from gpvo.geometry import se3
 from gpvo.io.foreign import T_FLU_OPTICAL
 from gpvo.io.trajectory import write_tum
-from gpvo.live.doctor import examine
+from gpvo.live.doctor import examine, examine_bag
 from gpvo.live.stated import Stated
 from gpvo.publish.odometry import Odometry
 from gpvo.publish.ros import odometry_message
@@ -252,3 +252,10 @@ def test_what_is_beyond_all_measure_is_found_and_overflows_nothing(absurd: float
         maker.add(TOPIC, odometry_message(wild if k in (0, 70, last) else o, maker.store.types), o.t_ns)
     codes = {f.code for f in examine(Stated.of(m for _, _, m in maker.messages))}
     assert "pose-not-finite" in codes
+
+
+@pytest.mark.parametrize(("name", "told"), [("gone.bag", "no such bag"), ("notes.txt", "is not a bag")])
+def test_what_is_no_bag_is_told_from_what_is_not_there(name: str, told: str, tmp_path: Path) -> None:
+    (tmp_path / "notes.txt").write_text("x\n")
+    with pytest.raises(GpvoError, match=rf"{name}: {told} \(for a running topic add --zenoh"):
+        examine_bag(tmp_path / name)

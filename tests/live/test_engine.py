@@ -38,6 +38,7 @@ from gpvo.publish.odometry import messages as offline
 from gpvo.types import Status, StereoCamera, VoLog, VoRecord
 from rosbags.rosbag2 import Writer
 from shim_bags import STATED, TOPIC, Kept, engine, flight, flown, messages, save_model, shim_predictor
+from small_model import small_model
 from synthetic_runs import make_run
 
 
@@ -330,6 +331,16 @@ def test_a_warning_whose_numbers_change_is_repeated_every_ten_seconds_as_well() 
     for second in range(26):
         live.take(Arrival("/other", None, second * 10**9))
     assert sum("% of the images" in text for text in told) == 3
+
+
+def test_inputs_that_the_odometry_does_not_give_are_named() -> None:
+    """A model of images, asked about poses: not the surroundings are unknown, the model is the wrong one."""
+    stamps, T = flight(n=60)
+    live, kept, told = engine(predictor=small_model().predictor())
+    for arrival in flown(stamps, T):
+        live.take(arrival)
+    assert any("the input lacks n_inliers, ln_var_" in text for text in told)
+    assert "n_inliers" in kept.reports[-1].text
 
 
 def test_an_odometry_at_another_rate_or_outside_the_domain_is_called_out() -> None:

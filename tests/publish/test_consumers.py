@@ -87,7 +87,11 @@ def test_check_names_the_parameter_that_hides_the_prediction(odometry: list[Odom
     assert not velocity.advice
     tiny = [replace(o, twist_covariance=np.eye(6) * 1e-3**2) for o in odometry]
     velocity = next(v for v in consumers.check(tiny, "px4") if v.quantity == "velocity")
-    assert "Set EKF2_EVV_NOISE to 0.01, the smallest it accepts" in velocity.advice
+    assert "Set EKF2_EVV_NOISE to 0.01, the smallest it accepts, which hides 100 %" in velocity.advice
+    part = [replace(o, twist_covariance=np.eye(6) * (1e-3 if k % 4 else 2e-2) ** 2) for k, o in enumerate(odometry)]
+    velocity = next(v for v in consumers.check(part, "px4") if v.quantity == "velocity")
+    hidden = 100 * np.mean([k % 4 > 0 for k in range(len(odometry))])
+    assert velocity.advice.endswith(f"which hides {hidden:.0f} %")
 
 
 def test_check_of_the_others(odometry: list[Odometry]) -> None:
@@ -135,4 +139,5 @@ def test_fusioncore_loses_what_lies_in_correlations(odometry: list[Odometry]) ->
     )
     assert [v.hidden_percent for v in consumers.check(flat, "fusioncore")] == [0.0, 0.0]
     assert [v.hidden_percent for v in consumers.check(slanted, "fusioncore")] == [100.0, 0.0]
+    assert "use of the diagonal alone hides it in 100 %" in str(consumers.check(slanted, "fusioncore")[0])
     assert "send no zeros" in str(consumers.check(slanted, "fusioncore")[0])

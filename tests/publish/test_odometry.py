@@ -10,7 +10,7 @@ from gpvo.errors import GpvoError
 from gpvo.geometry import se3
 from gpvo.geometry.se3 import R_FLU_OPTICAL
 from gpvo.publish.odometry import LEAST_VARIANCE, OdometryBuilder, lift, messages
-from gpvo.types import Prediction, Status, VoRecord
+from gpvo.types import IMPORTED_POSE, Prediction, Status, VoRecord
 from synthetic_flights import ErrorLaw, Events, synthetic_flight
 
 from motion_errors import prediction
@@ -223,11 +223,17 @@ def test_floors_hide_no_prediction_of_a_slow_or_tiny_rig() -> None:
 
 
 def test_no_covariance_is_one_clear_line() -> None:
-    with pytest.raises(GpvoError, match="neither a prediction nor a 'triangulation'"):
+    with pytest.raises(GpvoError, match="neither a prediction nor a covariance of its motion 'triangulation'"):
         OdometryBuilder(method="triangulation").step(VoRecord(10**8, 0, Status.OK, np.eye(4)))
     bad = _prediction(10**8, np.eye(6), -3.0 * np.eye(6), np.eye(6))
     with pytest.raises(GpvoError, match="not symmetric positive definite"):
         OdometryBuilder().step(VoRecord(10**8, 0, Status.OK, np.eye(4)), bad)
+
+
+def test_the_covariance_of_a_pose_is_not_published_as_that_of_a_motion() -> None:
+    record = VoRecord(10**8, 0, Status.OK, np.eye(4), covariances={IMPORTED_POSE: np.eye(6), "spherical": np.eye(6)})
+    with pytest.raises(GpvoError, match=r"'imported_pose' \(give --model or --method spherical\)"):
+        OdometryBuilder(method=IMPORTED_POSE).step(record)
 
 
 def test_every_covariance_of_a_bursty_flight_is_positive_definite() -> None:

@@ -84,6 +84,8 @@ def test_command(tmp_path):
     made = run(app, ["simulate", "room-t265", "--points", "-o", str(out), "--duration", "5", "--json"])
     assert json.loads(made.output)["flights"][0]["frames"] == 101
     assert out.is_file()
+    as_jpg = run(app, ["simulate", "tunnel", "--preview", str(tmp_path / "a.jpg")])
+    assert "a.jpg: does not have the suffix of a PNG (end it in .png)" in str(as_jpg.exception)
     assert "nowhere to write" in str(run(app, ["simulate", "room-t265"]).exception)
 
 

@@ -301,13 +301,15 @@ def test_a_run_without_truth_is_refused_before_twins_are_made_to_compare_it_with
     assert not (tmp_path / "t").exists()
 
 
-def test_evaluate_by_twins_with_and_without_truth(flown, blind):
+def test_evaluate_by_twins_with_and_without_truth(flown, blind, monkeypatch):
     own = json.loads(gpvo("evaluate", flown[0] / "run", "--twins", "--replicates", 3, "--json").stdout)["runs"][0]
     assert 0.4 < own["methods"]["twin"]["nees_dof"]["joint"] < 2.5
     assert "simulated_truth" not in own
+    monkeypatch.setattr("gpvo.evaluation.evaluate.estimate_truth_noise", lambda *_: np.full(6, 1e-3))
     by_twins = json.loads(gpvo("evaluate", blind, "--twins", "--replicates", 2, "--json").stdout)["runs"][0]
     assert by_twins["simulated_truth"]["twins"] == 2
     assert by_twins["verdict"] is None  # words have no mean
+    assert by_twins["truth_sigma"] == {"translation_m": 0.0, "rotation_rad": 0.0}  # what is simulated is exact
     assert "twin" not in str(by_twins["source"])
     for method in ("triangulation", "pointing_matching"):
         real, simulated = (d["methods"][method]["nees_dof"]["joint"] for d in (own, by_twins))
