@@ -54,6 +54,7 @@ from gpvo.types import STANDARD_GRAVITY_MPS2, Array, ImuNoise, MotionError
 _POSE = np.array([0, 1, 2, 6, 7, 8])  # position and attitude inside the core
 _STATE = CLONE.stop  # core and clone; what follows is VO's
 _MOST_SPEED_VAR, _MOST_ANGLE_VAR = 100.0, 0.1  # (10 m/s)^2, (18 deg)^2: no state is doubted beyond
+_FAR_M, _ROUNDINGS = 1e3, 64.0
 _UNSEEN_TURN_RAD, _UNSEEN_TILT_RAD = 1.0, 0.2  # about and from the vertical, while nothing is heard
 
 
@@ -230,6 +231,7 @@ class ErrorStateFilter:
         """
         r = residual - (H @ self.dx[:, :, None])[:, :, 0]
         PHt = self.P @ transpose(H)
+        R = R + self._rounding(H)
         S = H @ PHt + R
         L = np.asarray(np.linalg.cholesky(S), dtype=np.float64)
         whitened: Array = np.linalg.solve(L, np.concatenate([transpose(PHt), r[:, :, None]], axis=2))
@@ -256,6 +258,13 @@ class ErrorStateFilter:
             self._joseph(K, H, PHt, R)
             self.dx += (K @ r[:, :, None])[:, :, 0]
         return Innovation(r, S, nis, passed, used, own_fault)
+
+    def _rounding(self, H: Array) -> Array:
+        """(B, m, m) by what a motion is read off less well where the place, which it does not depend on, is so unsure
+        that its variance leaves the motion's own too few digits; zero up to a sigma of a kilometre."""
+        largest = variances(self.P)[:, P].max(axis=1)
+        lost = np.where(largest > _FAR_M**2, _ROUNDINGS * np.finfo(float).eps * largest, 0.0)
+        return np.asarray((lost[:, None] * np.square(H[:, :, P]).sum(axis=2))[:, :, None] * np.eye(H.shape[1]))
 
     def _own_part(self, H: Array, S: Array, r: Array) -> Array:
         """How much of the NIS (B,) state and clone have to answer for (see the gate's ``Wait``)."""

@@ -41,7 +41,7 @@ class ClockShift:
 
 class Rotations:
     """``vo`` (M, 3): rotation vectors of VO's motions, in IMU axes [rad], and those of the gyroscope between the same
-    stamps.
+    stamps, ``dt_s`` (M,) apart.
 
     Motions within ``margin_s`` of the ends of the IMU's log are left out.
     """
@@ -55,6 +55,7 @@ class Rotations:
         T = np.array([r.T_prev_cur[:3, :3] for r in used]).reshape(-1, 3, 3)
         self.vo: Array = se3.so3_log(T) @ R_imu_cam.T
         self._ends = [np.array([(getattr(r, n) - imu.t_ns[0]) * 1e-9 for r in used]) for n in ("t_ns", "t_prev_ns")]
+        self.dt_s: Array = self._ends[0] - self._ends[1]
         self._t = (imu.t_ns - imu.t_ns[0]) * 1e-9
         self._turned = integral(imu.gyro_radps, self._t)
 

@@ -1,14 +1,18 @@
 """Which IMU samples are plausible: in the range of a sensor, consistent with earlier ones, noisy, and on one clock.
 
-What cannot be is missing, not wrong: the filter bridges it and is less sure (see ``Timeline``).
+What cannot be is missing, not wrong: the filter bridges it by the likeliest readings and is less sure
+(:class:`Samples`).
 """
 
 from __future__ import annotations
 
+import bisect
+import math
+
 import numpy as np
 from numpy.typing import NDArray
 
-from gpvo.stats.series import Doubt
+from gpvo.stats.series import Doubt, integral, interpolated
 from gpvo.types import Array, ImuLog
 
 MOST_RADPS, MOST_MPS2 = 30.0, 150.0
@@ -20,6 +24,9 @@ _LEAST_STEP = np.repeat([3.0, 30.0], 3)  # [rad/s, m/s^2] that two samples may a
 _STUCK = 8  # samples with the very same reading: a sensor has noise, and held ones repeat two or four times
 _TIMES_USUAL = 20.0  # the usual step that they may differ by, where that is more
 _FORGET = 0.02
+# An interval this many times the usual one, and at least this long, is a gap.
+_GAP_FACTOR, GAP_S = 5.0, 0.05
+_NEARBY = 1000  # samples that tell how far a guess over a gap may be off
 
 
 class ImuGuard:
@@ -96,3 +103,99 @@ def cleaned(imu: ImuLog) -> ImuLog:
     """The log without samples that cannot be used."""
     good = usable(imu)
     return ImuLog(imu.t_ns[good], imu.gyro_radps[good], imu.acc_mps2[good], imu.noise)
+
+
+class Samples:
+    """Stamps ``t_ns``, growing, and readings ``values`` (6,) each, gyroscope first [rad/s, m/s^2]."""
+
+    def __init__(self) -> None:
+        self.t_ns: list[int] = []
+        self.values: list[Array] = []
+
+    def copy(self) -> Samples:
+        """An independent list of the same samples."""
+        other = Samples()
+        other.t_ns, other.values = self.t_ns.copy(), self.values.copy()
+        return other
+
+    def insert(self, t_ns: int, sample: Array) -> None:
+        """Put a sample in its place."""
+        i = bisect.bisect_left(self.t_ns, t_ns)
+        self.t_ns.insert(i, t_ns)
+        self.values.insert(i, sample)
+
+    def reach(self, t_ns: int) -> bool:
+        """Whether there is one at or past ``t_ns``."""
+        return bool(self.t_ns) and self.t_ns[-1] >= t_ns
+
+    def drop_before(self, t_ns: int) -> None:
+        """Forget what comes before the last one at or before ``t_ns``, once that is a thousand or more."""
+        keep = bisect.bisect_right(self.t_ns, t_ns) - 1
+        if keep > 1000:
+            del self.t_ns[:keep], self.values[:keep]
+
+    def shortest_gap_s(self, i: int) -> float:
+        """Of an interval near sample i, from which on samples are missing."""
+        return max(GAP_S, _GAP_FACTOR * self.usual_step_s(i))
+
+    def is_missing(self, i: int) -> bool:
+        """Whether there is a gap before sample i, which samples that come late may fill."""
+        return i > 0 and self.t_ns[i] - self.t_ns[i - 1] > 2.5e9 * self.usual_step_s(i)  # two came to show it
+
+    def usual_step_s(self, i: int) -> float:
+        """Median step near sample i, 0 where nothing tells."""
+        steps = np.diff(self.t_ns[max(0, i - 100) : i + 100])
+        return 1e-9 * float(np.median(steps)) if len(steps) else 0.0
+
+    def at(self, t_ns: int, i: int) -> Array:
+        """Sample at ``t_ns``, between samples i-1 and i; held beyond the ends."""
+        if i == 0:
+            return self.values[0]
+        if i >= len(self.t_ns) or self.t_ns[i - 1] == t_ns:
+            return self.values[min(i, len(self.t_ns)) - 1]
+        t0, t1 = self.t_ns[i - 1], self.t_ns[i]
+        share = (t_ns - t0) / (t1 - t0)
+        return (1.0 - share) * self.values[i - 1] + share * self.values[i]
+
+    def over_gap(self, i: int, start_ns: int, end_ns: int, ends: Array) -> tuple[Array, Array] | None:
+        """What to take for the readings ``ends`` (2, 6) across missing samples, and by how much (6,) they may be off;
+        None where none are missing.
+
+        A gap may be crossed in several steps, a record at the end of each. Where the sample after it has not come, the
+        guess is wrong the same way in all: what its error grew to by the end of this step, less what it was at its
+        start. Else each step has its share of the variance, as nobody knows where the readings went between.
+        """
+        last_ns = self.t_ns[i - 1] if i > 0 else start_ns
+        age = [(t_ns - last_ns) * 1e-9 for t_ns in (start_ns, end_ns)]
+        if age[1] < GAP_S:
+            return None
+        shortest = self.shortest_gap_s(i)
+        if age[1] < shortest:
+            return None
+        begun = age[0] if age[0] >= shortest else 0.0
+        is_held = i == 0 or i >= len(self.t_ns)
+        length_s = age[1] if is_held else (self.t_ns[i] - last_ns) * 1e-9
+        guess, missed = self._guess(i, length_s, ends, is_held)
+        grown = age[1] ** 2 - begun**2 if is_held else length_s * (age[1] - begun)
+        return guess, missed * math.sqrt(grown) / (age[1] - age[0])
+
+    def _guess(self, i: int, length_s: float, ends: Array, is_held: bool) -> tuple[Array, Array]:
+        """Readings (2, 6) over a gap of ``length_s`` before sample i, and the rms (6,) by which such a guess misses the
+        mean reading over stretches as long of the samples nearby: the line between the samples at its ends, the last
+        one held where no other came, or, where that is better, the mean of those nearby."""
+        near = slice(i, i + _NEARBY) if 2 * i < len(self.t_ns) else slice(max(0, i - _NEARBY), i)
+        t_s, values = (np.array(self.t_ns[near]) - self.t_ns[near.start]) * 1e-9, np.array(self.values[near])
+        length_s = min(length_s, 0.5 * float(t_s[-1]))
+        if length_s <= 0:
+            return ends, np.abs(values).max(axis=0)
+        usual, total = values.mean(axis=0), integral(values, t_s)
+        later = t_s[t_s + length_s <= t_s[-1]] + length_s
+        begin, end = values[: len(later)], interpolated(later, t_s, values)
+        mean = (interpolated(later, t_s, total) - total[: len(later)]) / length_s
+        guesses = (begin if is_held else 0.5 * (begin + end), usual)
+        of_line, of_mean = (np.sqrt(np.square(mean - guess).mean(axis=0)) for guess in guesses)
+        # Readings at its ends that are unlike those nearby may have changed anywhere between.
+        known = ends if is_held else np.array(self.values[i - 1 : i + 1])
+        of_line = np.maximum(of_line, np.abs(known[1] - known[0]) / math.sqrt(12.0))
+        of_mean = np.maximum(of_mean, 0.5 * np.abs(known - usual).max(axis=0))
+        return np.where(of_mean < of_line, usual, ends), np.minimum(of_mean, of_line)

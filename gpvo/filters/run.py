@@ -16,8 +16,9 @@ from gpvo.filters.measurement import Gate, Innovation
 from gpvo.filters.plausible import usable
 from gpvo.filters.policies import Policy
 from gpvo.filters.propagation import DEFAULT_IMU_NOISE, TH, constant_velocity_noise, each
+from gpvo.filters.rivals import Step
 from gpvo.filters.start import Start, StartSigmas, from_rest, from_truth, tilt_of, vertical_in_world
-from gpvo.filters.timeline import Step, Timeline
+from gpvo.filters.timeline import Timeline
 from gpvo.geometry import se3
 from gpvo.types import STANDARD_GRAVITY_MPS2, Array, ImuLog, Prediction, VoLog, VoRecord
 

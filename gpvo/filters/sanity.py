@@ -22,6 +22,7 @@ from gpvo.filters.imu_motion import (
 )
 from gpvo.filters.plausible import MOST_MPS2, MOST_RADPS, on_one_clock, usable
 from gpvo.filters.run import Flight
+from gpvo.filters.start import StartSigmas
 from gpvo.geometry import se3
 from gpvo.geometry.covariance import is_positive_definite
 from gpvo.types import STANDARD_GRAVITY_MPS2, Array, ImuLog
@@ -34,6 +35,7 @@ _RELABELLINGS = sorted(
 _AXES_WINDOW_S = 10.0
 _TOGETHER = 0.7  # correlation of all rotations from which names of axes are not chance
 _APART_DEG, _EXPLAINED, _TWO_AXES = 10.0, 0.25, 0.05
+_MOST_BIAS = 4.0  # of the sigma that a filter starts with
 _WINDOWS_S, _MIN_WINDOWS = (2.0, 1.4, 1.0, 0.7), 5  # the first lengths of which a flight holds so many
 
 
@@ -212,6 +214,7 @@ def _gyroscope(flight: Flight, imu: ImuLog) -> Iterator[Finding]:
         yield _late(late)
     turns = Rotations(flight, imu)
     vo, gyro = turns.vo, turns.gyro(0.0 if late is None else late.shift_s)
+    bias = list(_gyro_bias(turns, gyro))
     if len(vo) >= MIN_ROTATIONS:
         vo, gyro = about_their_means(vo, gyro)
     energy_vo, energy_gyro = (vo**2).sum(), (gyro**2).sum()
@@ -252,6 +255,21 @@ def _gyroscope(flight: Flight, imu: ImuLog) -> Iterator[Finding]:
     elif late is None and (angle_deg := _apart_deg(vo, gyro)):
         text = f"gyroscope and VO turn about axes that are {angle_deg:.0f} degrees apart, always the same way"
         yield Finding("gyro_axes", text, "T_imu_cam is wrong by that rotation", fatal=False)
+    elif not renamed and 0.4 < scale < 2.5:
+        yield from bias
+
+
+def _gyro_bias(turns: Rotations, gyro: Array) -> Iterator[Finding]:
+    """What the gyroscope's rotations (M, 3) have over VO's in every stretch of the flight alike."""
+    rates = (gyro - turns.vo) / np.maximum(turns.dt_s, 1e-9)[:, None]
+    if len(rates) < 4 * MIN_ROTATIONS:
+        return
+    medians = np.array([np.median(part, axis=0) for part in np.array_split(rates, 4)])
+    bias, spread = medians.mean(axis=0), np.ptp(medians, axis=0)
+    if (np.abs(bias) > np.maximum(_MOST_BIAS * StartSigmas().gyro_bias_radps, spread)).any():
+        told = ", ".join(f"{v:.2f}" for v in np.degrees(bias))
+        text = f"the gyroscope reads ({told}) deg/s more than VO turns, throughout: more bias than filters expect"
+        yield Finding("gyro_bias", text, "subtract it, as the mean of readings at rest", fatal=False)
 
 
 def _apart_deg(vo: Array, gyro: Array) -> float:

@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field
+from itertools import pairwise
 
 import numpy as np
 from numpy.typing import NDArray
 
 from gpvo.errors import GpvoError
 from gpvo.filters.plausible import cleaned, usable
-from gpvo.filters.propagation import BA, BG, TH, Nominal, V
+from gpvo.filters.propagation import BA, BG, DEFAULT_IMU_NOISE, TH, Nominal, V
 from gpvo.geometry import se3
 from gpvo.stats.series import integral, interpolated
 from gpvo.types import STANDARD_GRAVITY_MPS2, Array, ImuLog
@@ -18,7 +19,7 @@ _SLOPE_POSES = 5  # true poses that the velocity at the start is taken from
 _STRETCH_S, _STRETCHES = 1.0, 15  # that the vertical is measured over: at least so long, at most so many
 _ROUNDS, _HUBER = 10, 2.0  # of reweighting; a stretch further off, in sigmas of its three axes together, counts less
 _MEDIAN_OF_NORM = 1.54  # of three standard normal numbers
-_LEAST_NOISE_MPS2 = 1e-4
+_OVERLAP = 1.5  # the mean of white noise under hats has so many times the variance that it had under separate ones
 _REST_S, _REST_SAMPLES = 0.5, 10  # that the vehicle must be at rest for, and IMU samples within that show it
 _MOST_GYRO_STD_RADPS, _MOST_ACC_STD_MPS2, _MOST_GYRO_MEAN_RADPS = 0.05, 0.5, 0.1  # of an IMU at rest
 
@@ -174,29 +175,32 @@ def vertical_in_world(
     """Unit vector (3,) of the vertical, and the covariance (3, 3) of the angles [rad] about the world's axes by which
     it may be wrong, where a bias of the accelerometer has this standard deviation.
 
-    Over a stretch, the mean specific force in the world less the mean acceleration is gravity's reaction plus the bias,
-    turned as the vehicle was on average: what turns with it is bias, the rest is up. Least squares over many stretches
-    with Huber's weights, which readings of a failing IMU do not move far.
+    From one stretch to the next the mean velocity changes by the acceleration under a hat as wide as both: no slope of
+    truth's path is needed, which sparse poses do not tell. The specific force under that hat, in the world, less that
+    is gravity's reaction plus the bias, turned as the vehicle was: what turns with it is bias, the rest is up. Least
+    squares over many hats with Huber's weights, which readings of a failing IMU do not move far.
     """
-    imu = cleaned(imu)
-    t_s, imu_s = (t_ns - t_ns[0]) * 1e-9, (imu.t_ns - t_ns[0]) * 1e-9
-    force = interpolated(t_s, imu_s, imu.acc_mps2)
-    R = T_world_imu[:, :3, :3]
-    rates = np.concatenate([R @ force[:, :, None], R], axis=2)  # (N, 3, 4) in the world: specific force, bias per unit
-    summed = integral(rates.reshape(-1, 12), t_s).reshape(-1, 3, 4)
-    summed[:, :, 0] -= np.gradient(T_world_imu[:, :3, 3], t_s, axis=0)
-    count = int(np.clip(t_s[-1] / _STRETCH_S, 1, _STRETCHES))
+    t_s = (t_ns - t_ns[0]) * 1e-9
+    count = int(np.clip(t_s[-1] / _STRETCH_S, 2, _STRETCHES))
     ends = np.unique(np.searchsorted(t_s, np.linspace(0.0, t_s[-1], count + 1)))
-    means = np.diff(summed[ends], axis=0) / np.diff(t_s[ends])[:, None, None]
+    rising, falling = _under_slopes(cleaned(imu), t_ns, T_world_imu, ends)
+    if len(ends) < 3:  # two poses tell no acceleration: it is taken to be none
+        means = (rising + falling) / t_s[-1]
+    else:
+        means = rising[:-1] + falling[1:]
+        means[:, :, 0] -= np.diff(np.diff(T_world_imu[ends, :3, 3], axis=0) / np.diff(t_s[ends])[:, None], axis=0)
+        means /= 0.5 * (t_s[ends][2:] - t_s[ends][:-2])[:, None, None]
     seen, turned = means[:, :, 0], means[:, :, 1:]
     X = np.concatenate([np.broadcast_to(np.eye(3), turned.shape), turned], axis=2)
     prior = np.diag(np.repeat([0.0, acc_bias_mps2**-2], 3))
     x = np.append(np.median(seen, axis=0), np.zeros(3))
+    density = (imu.noise or DEFAULT_IMU_NOISE).acc_density_mps2_sqrthz
+    least = density * float(np.sqrt(_OVERLAP**-1 / t_s[-1] * count))
     free = seen.size - 3.0
     for _ in range(_ROUNDS):
         off = np.linalg.norm(seen - X @ x, axis=1)
-        sigma = max(float(np.median(off)) / _MEDIAN_OF_NORM * np.sqrt(seen.size / max(free, 1.0)), _LEAST_NOISE_MPS2)
-        weight = sigma**-2 / np.maximum(off / (_HUBER * sigma), 1.0)
+        sigma = max(float(np.median(off)) / _MEDIAN_OF_NORM * np.sqrt(seen.size / max(free, 1.0)), least)
+        weight = sigma**-2 / _OVERLAP / np.maximum(off / (_HUBER * sigma), 1.0)
         fitted = np.einsum("n,nij,nik->jk", weight, X, X)
         C = np.linalg.inv(fitted + prior)
         x = C @ np.einsum("n,nij,ni->j", weight, X, seen)
@@ -204,6 +208,32 @@ def vertical_in_world(
     up, g = x[:3] / np.linalg.norm(x[:3]), float(np.linalg.norm(x[:3]))
     turn = se3.skew(up) / g  # an error of the vector turns it by up x error / g
     return up, turn @ C[:3, :3] @ turn.T
+
+
+def _under_slopes(
+    imu: ImuLog, t_ns: NDArray[np.int64], T_world_imu: Array, ends: NDArray[np.int64]
+) -> tuple[Array, Array]:
+    """(n, 3, 4) each: integrals over the stretches between these ``ends`` (n + 1,) of specific force and, per unit of
+    each axis, bias, both in the world, times a weight that rises from 0 to 1, and one that falls.
+
+    Between the true poses the gyroscope turns the IMU; what it misses until the next pose is spread evenly.
+    """
+    t_s, imu_s = (t_ns - t_ns[0]) * 1e-9, (imu.t_ns - t_ns[0]) * 1e-9
+    R_true, slopes = T_world_imu[:, :3, :3], []
+    turned = integral(imu.gyro_radps, imu_s)
+    step = np.swapaxes(R_true[:-1], 1, 2) @ R_true[1:]
+    by_gyro = se3.so3_exp(np.diff(interpolated(t_s, imu_s, turned), axis=0))
+    missed = se3.so3_log(np.swapaxes(by_gyro, 1, 2) @ step)
+    for first, last in pairwise(ends.tolist()):
+        at_s = np.union1d(t_s[first : last + 1], imu_s[(imu_s > t_s[first]) & (imu_s < t_s[last])])
+        k = np.clip(np.searchsorted(t_s, at_s, side="right") - 1, first, last - 1)
+        share = (at_s - t_s[k]) / (t_s[k + 1] - t_s[k])
+        since = interpolated(at_s, imu_s, turned) - interpolated(t_s[k], imu_s, turned)
+        R = R_true[k] @ se3.so3_exp(since) @ se3.so3_exp(share[:, None] * missed[k])
+        rates = np.concatenate([R @ interpolated(at_s, imu_s, imu.acc_mps2)[:, :, None], R], axis=2).reshape(-1, 12)
+        rise = ((at_s - at_s[0]) / (at_s[-1] - at_s[0]))[:, None]
+        slopes.append([integral(rates * weight, at_s)[-1].reshape(3, 4) for weight in (rise, 1.0 - rise)])
+    return np.array([s[0] for s in slopes]), np.array([s[1] for s in slopes])
 
 
 def tilt_of(up: Array) -> tuple[float, Array]:

@@ -130,11 +130,15 @@ def position_in_world(T_world_cur: Array, covariance: Array) -> Array:
     return R @ covariance[..., :3, :3] @ np.swapaxes(R, -1, -2)
 
 
-def lost_covariance(dt_s: float, twist: Array) -> Array:
+_ANY_MPS = 15.0  # a car in town, a multirotor at its fastest
+
+
+def lost_covariance(dt_s: float, twist: Array | None) -> Array:
     """(6, 6) covariance of a motion that was not measured but extrapolated over ``dt_s``.
 
     A vehicle may have stopped, or doubled its speed, or started from rest at one m/s and half a radian per second.
+    ``twist`` (6,) is the last one measured; None where none was yet: it may have come as fast as vehicles go.
     """
-    speed, rate = float(np.linalg.norm(twist[:3])), float(np.linalg.norm(twist[3:]))
+    speed, rate = (_ANY_MPS, 0.0) if twist is None else (float(np.linalg.norm(v)) for v in (twist[:3], twist[3:]))
     sigma_m, sigma_rad = dt_s * max(speed, 1.0), dt_s * max(rate, 0.5)
     return np.diag([max(sigma_m, 1e-3) ** 2] * 3 + [max(sigma_rad, 1e-3) ** 2] * 3)

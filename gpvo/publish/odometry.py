@@ -96,7 +96,7 @@ class OdometryBuilder:
         self._T_odom_cam = self.T_odom_body @ self._T_body_cam
         self._chain: dict[int, _Chain] = {}
         self._last: tuple[_Chain, Array] | None = None  # the last good frame and its noise
-        self._speed = np.zeros(6)
+        self._speed: Array | None = None
 
     def place(self, T_body_cam: Array) -> None:
         """From here on, messages are of the body on which the camera sits at ``T_body_cam`` (4, 4)."""

@@ -241,7 +241,8 @@ class StereoOdometry:
             moments = ResidualMoments.of(motion.residuals, white.moved.G)
             record = replace(record, **motion_fields(matches, motion, self.camera, moments))
         if motion is None or verdict.status is Status.LOST:
-            C = lost_covariance((t_ns - state.t_believed_ns) * 1e-9, state.twist)
+            known = None if state.t_twist_ns is None else state.twist
+            C = lost_covariance((t_ns - state.t_believed_ns) * 1e-9, known)
             return replace(
                 record,
                 n_tracked=matches.n_tracked,

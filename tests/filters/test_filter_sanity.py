@@ -62,6 +62,17 @@ def test_a_wrong_imu_is_named(flight: Flight, change: Callable[[ImuLog], ImuLog]
     assert "\n" not in str(error.value)
 
 
+@pytest.mark.parametrize("axis", [0, 1, 2])
+def test_a_bias_beyond_what_filters_expect_is_measured(flight: Flight, axis: int) -> None:
+    bias = np.radians(5.0) * np.eye(3)[axis]
+    biased = _with_imu(flight, lambda imu: replace(imu, gyro_radps=imu.gyro_radps + bias))
+    (finding,) = check_flight(biased)
+    assert finding.kind == "gyro_bias"
+    assert not finding.fatal
+    told = [float(v) for v in re.findall(r"-?\d+\.\d+", finding.text)]
+    np.testing.assert_allclose(np.radians(told), bias, atol=np.radians(0.5))  # its own is 0.1 deg/s
+
+
 def test_a_wrong_gyroscope_is_named_beside_slow_frames() -> None:
     slow = synthetic_flight(4, duration_s=60, rate_hz=1.0)
     assert [f for f in check_flight(slow) if f.fatal] == []

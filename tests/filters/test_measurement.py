@@ -124,3 +124,25 @@ def test_a_considered_bias_counts_but_is_not_estimated() -> None:
     added = 5e-3 * 20.0 * seconds
     sigma = np.sqrt(unsure.P[0, :3, :3].trace() / 3.0 - sure.P[0, :3, :3].trace() / 3.0)
     assert 0.5 * added < sigma < 1.25 * added
+
+
+@pytest.mark.parametrize("sigma_m", [1e3, 1e5, 1e6, 1e7, 1e8])
+def test_motions_are_used_wherever_the_vehicle_may_be(sigma_m: float) -> None:
+    """As after an hour by the IMU alone: motions go on telling how it moves, as well as rounding lets them."""
+    flight = synthetic_flight(3, duration_s=6)
+    assert flight.imu is not None
+    start, gravity = begin(flight, FuseOptions())
+    filter = make_filter(flight, start, gravity, 1, FuseOptions())
+    filter.P[:, P, P] += sigma_m**2 * np.eye(3)
+    filter.clone()
+    timeline = Timeline(filter, flight.records[0].t_ns, LearnedPolicy())
+    for sample in zip(flight.imu.t_ns.tolist(), flight.imu.gyro_radps, flight.imu.acc_mps2, strict=True):
+        timeline.add_imu(*sample)
+    for record in flight.records:
+        timeline.add_vo(record, flight.predictions.get(record.t_ns))
+    assert timeline.counts["used"] >= len(flight.records) - 4
+    variance = np.diagonal(timeline.filter.covariance[0])
+    assert (variance > 0).all()
+    turn = se3.so3_log(timeline.filter.x.R_world_imu[0].T @ flight.T_world_imu[-1, :3, :3])
+    assert (np.abs(turn) < 4.0 * np.sqrt(variance[TH])).all()
+    assert np.linalg.norm(timeline.filter.x.position[0] - flight.T_world_imu[-1, :3, 3]) < 2.0

@@ -96,6 +96,13 @@ def test_a_lost_frame_before_any_motion_of_which_nothing_is_stated_is_no_exact_o
     assert (np.sqrt(np.diagonal(out.pose_covariance)) > np.repeat([0.4, 0.2], 3)).all()
 
 
+@pytest.mark.parametrize("speed_mps", [0.0, 2.0, 14.0, 30.0])
+def test_before_any_motion_a_lost_frame_fits_vehicles_of_any_speed(speed_mps: float) -> None:
+    out = OdometryBuilder(floor=TINY).step(VoRecord(10**8, 0, Status.LOST, np.eye(4)))
+    moved = se3.exp(np.array([0, 0, 0.1 * speed_mps, 0, 0, 0]))[:3, 3]
+    assert moved @ np.linalg.solve(out.pose_covariance[:3, :3], moved) < 9.0
+
+
 def test_after_a_break_the_twist_is_that_of_the_motion_alone() -> None:
     C, step = 1e-6 * np.eye(6), se3.exp(np.array([0, 0, 0.1, 0, 0, 0]))
     guess = se3.exp(np.array([0.3, 0, 1.5, 0, 0, 0]))

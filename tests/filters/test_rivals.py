@@ -1,0 +1,115 @@
+"""One clock alone is set in flight, VO's or the IMU's; and what only looks like it."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from functools import cache
+
+import numpy as np
+import pytest
+from gpvo.filters.policies import LearnedPolicy
+from gpvo.filters.propagation import P
+from gpvo.filters.run import Flight, FuseOptions, begin, make_filter
+from gpvo.filters.timeline import Timeline
+from gpvo.geometry import se3
+from gpvo.types import Status, VoRecord
+from numpy.typing import NDArray
+from synthetic_flights import synthetic_flight
+
+SET_S = 3.0
+SHIFTS_S = [0.1, 0.3, 1.013, 2.0, -0.1, -0.3, -1.013, -2.0]
+
+
+def _timeline(flight: Flight) -> Timeline:
+    start, gravity = begin(flight, FuseOptions())
+    return Timeline(make_filter(flight, start, gravity, 1, FuseOptions()), flight.records[0].t_ns, LearnedPolicy())
+
+
+def _fly(flight: Flight, records: list[VoRecord], imu_ns: NDArray[np.int64], *, as_stamped: bool = False) -> Timeline:
+    """Samples and records as they come: record k at the true time of frame k, or as their stamps put them."""
+    imu, timeline, i = flight.imu, _timeline(flight), 0
+    assert imu is not None
+    for told, true in zip(records, flight.records, strict=True):
+        while i < len(imu_ns) and (not timeline.reaches(told.t_ns) if as_stamped else imu.t_ns[i] <= true.t_ns):
+            timeline.add_imu(int(imu_ns[i]), imu.gyro_radps[i], imu.acc_mps2[i])
+            i += 1
+        timeline.add_vo(told, flight.predictions.get(true.t_ns))
+    return timeline
+
+
+@cache
+def _flight(seed: int) -> tuple[Flight, Timeline]:
+    """And what the filter makes of it as it is."""
+    flight = synthetic_flight(seed, duration_s=10)
+    assert flight.imu is not None
+    return flight, _fly(flight, list(flight.records), flight.imu.t_ns)
+
+
+def _ends_alike(found: Timeline, usual: Timeline) -> None:
+    off_m = np.linalg.norm(found.filter.x.position - usual.filter.x.position)
+    assert off_m < 0.1 * np.sqrt(np.trace(usual.filter.covariance[0, P, P]))
+    np.testing.assert_allclose(found.filter.covariance[0, P, P], usual.filter.covariance[0, P, P], rtol=0.05, atol=1e-7)
+
+
+@pytest.mark.parametrize("as_stamped", [False, True])
+@pytest.mark.parametrize("shift_s", SHIFTS_S)
+@pytest.mark.parametrize("clock", ["vo", "vo, the reference by the new clock", "imu"])
+def test_a_clock_that_is_set_alone_changes_nothing(clock: str, shift_s: float, as_stamped: bool) -> None:
+    flight, usual = _flight(5)
+    begin_ns, set_ns = flight.records[0].t_ns + round(SET_S * 1e9), round(shift_s * 1e9)
+    assert flight.imu is not None
+    records, imu_ns = list(flight.records), flight.imu.t_ns
+    if clock == "imu":
+        imu_ns = imu_ns + set_ns * (imu_ns >= begin_ns)
+    else:
+        by_new = 1 if "new" in clock else 0
+        told = [(r.t_ns >= begin_ns, r.t_prev_ns >= begin_ns or (by_new and r.t_ns >= begin_ns)) for r in records]
+        records = [
+            replace(r, t_ns=r.t_ns + set_ns * bool(now), t_prev_ns=r.t_prev_ns + set_ns * bool(before))
+            for r, (now, before) in zip(records, told, strict=True)
+        ]
+    found = _fly(flight, records, imu_ns, as_stamped=as_stamped)
+    assert found.counts["clock_set_ahead" if shift_s > 0 else "clock_set_back"] == 1
+    _ends_alike(found, usual)
+
+
+@pytest.mark.parametrize("silence_s", [0.2, 1.0, 3.0])
+@pytest.mark.parametrize("who", ["vo, lost", "vo, one long motion", "imu"])
+def test_a_silence_of_one_of_them_is_no_clock_that_was_set(who: str, silence_s: float) -> None:
+    for seed in range(3):
+        flight, _ = _flight(seed)
+        imu, begin_ns = flight.imu, flight.records[0].t_ns + round(SET_S * 1e9)
+        assert imu is not None
+        assert flight.T_world_cam is not None
+        end_ns = begin_ns + round(silence_s * 1e9)
+        timeline, came = _timeline(flight), np.searchsorted(imu.t_ns, [r.t_ns for r in flight.records], side="right")
+        for k, record in enumerate(flight.records):
+            for i in range(came[k - 1] if k else 0, came[k]):
+                if who != "imu" or not begin_ns < imu.t_ns[i] <= end_ns:
+                    timeline.add_imu(int(imu.t_ns[i]), imu.gyro_radps[i], imu.acc_mps2[i])
+            if who != "imu" and begin_ns < record.t_ns <= end_ns:
+                continue
+            if who != "imu" and begin_ns < record.t_prev_ns <= end_ns:
+                first = int(np.searchsorted([r.t_ns for r in flight.records], begin_ns, side="right")) - 1
+                T = se3.inverse(flight.T_world_cam[first]) @ flight.T_world_cam[k]
+                status = Status.LOST if "lost" in who else Status.OK
+                record = replace(record, t_prev_ns=flight.records[first].t_ns, T_prev_cur=T, status=status)
+            timeline.add_vo(record, flight.predictions.get(record.t_ns))
+        assert timeline.counts["clock_set_ahead"] == timeline.counts["clock_set_back"] == 0
+        error = timeline.filter.x.position[0] - flight.T_world_imu[-1, :3, 3]
+        assert error @ np.linalg.solve(timeline.filter.covariance[0, P, P], error) / 3 < 5.0
+
+
+def test_a_record_sent_twice_or_late_starts_no_rival() -> None:
+    flight, usual = _flight(5)
+    assert flight.imu is not None
+    timeline = _timeline(flight)
+    for sample in zip(flight.imu.t_ns.tolist(), flight.imu.gyro_radps, flight.imu.acc_mps2, strict=True):
+        timeline.add_imu(*sample)
+    order = list(range(len(flight.records)))
+    order[60:63] = [62, 60, 61]
+    for k in [*order[:100], 97, 98, *order[100:]]:
+        timeline.add_vo(flight.records[k], flight.predictions.get(flight.records[k].t_ns))
+    assert timeline.counts["clock_set_back"] == 0
+    assert timeline.counts["repeated"] == 2
+    _ends_alike(timeline, usual)
