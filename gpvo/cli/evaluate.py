@@ -15,7 +15,7 @@ from gpvo.cli.common import refuse_twice
 from gpvo.cli.output import Json, cell, numbers, print_json, progress, say, show
 from gpvo.cli.twin import Seed, TwinOptions, Twins, make_all, say_simulated
 from gpvo.errors import GpvoError
-from gpvo.files import in_metres
+from gpvo.files import in_metres, refuse_foreign
 from gpvo.io.run import Run, read_run
 from gpvo.io.source import open_source
 from gpvo.io.trajectory import read_tum
@@ -134,6 +134,7 @@ def report(
 
     if sequence is not None and frames is None:
         raise GpvoError("--sequence has no effect without --frames", cure="add --frames, such as 5,80")
+    refuse_foreign(out, b"<title>gpvo report</title>", "report")  # before the work, not after it
     found = _evaluate(runs, judge, unjudged=True)
     pictures = [] if frames is None else _pictures(runs, frames, sequence)
     with progress("pages", 1):

@@ -12,7 +12,7 @@ import typer
 
 from gpvo.cli.output import Json, answer, print_json, progress, say, show
 from gpvo.errors import GpvoError
-from gpvo.files import make_folder, replacing, write_csv
+from gpvo.files import make_folder, refuse_foreign, write_csv
 from gpvo.io.parquet import write_table
 from gpvo.io.run import read_run, write_predictions
 from gpvo.io.run_folder import FILES
@@ -136,7 +136,7 @@ def forecast(
         int, "Simulated flights along the plan, each in different conditions.", {"min": 1, "max": 1000}
     ] = 8,
     seed: Annotated[int, "Random seed.", {"min": 0}] = 0,
-    plot: Annotated[Path | None, "PNG to write: top view, and sigma over distance."] = None,
+    plot: Annotated[Path | None, "Image to write: top view, and sigma over distance."] = None,
     out: Annotated[Path | None, "Every pose, as .parquet or .csv."] = None,
     json_: Json = False,
 ) -> None:
@@ -149,15 +149,20 @@ def forecast(
 
     if out is not None and out.suffix not in (".parquet", ".csv"):
         raise GpvoError("does not have the suffix of a table", where=out, cure="end it in .parquet or .csv")
-    predictor = Predictor.load(model).require_motions(model)
-    found = run_forecast(predictor, read_plan(path, predictor.model.dt_s, frame), draws=draws, seed=seed)
     if out is not None:
-        (write_table if out.suffix == ".parquet" else write_csv)(out, _columns(found))
+        refuse_foreign(out, b"cov_5_5", "forecast")
     if plot is not None:
         from gpvo.evaluation import plots
 
-        with replacing(plot) as temporary:
-            plots.forecast(found, path.name).savefig(temporary, dpi=110, format="png")
+        plots.require_picture(plot)  # before the work, not after it
+    predictor = Predictor.load(model).require_motions(model)
+    with progress("draws", draws) as advance:
+        plan = read_plan(path, predictor.model.dt_s, frame)
+        found = run_forecast(predictor, plan, draws=draws, seed=seed, on_draw=advance)
+    if out is not None:
+        (write_table if out.suffix == ".parquet" else write_csv)(out, _columns(found))
+    if plot is not None:
+        plots.save(plots.forecast(found, path.name), plot, dpi=110)
     answer(json_, _forecast_document(found, model, path, frame), lambda: _print_forecast(found, path))
 
 

@@ -19,7 +19,9 @@ from gpvo.evaluation.evaluate import Evaluation
 from gpvo.evaluation.forecast import Forecast
 from gpvo.evaluation.fusion import Trace, nis_band, nis_over_runs
 from gpvo.evaluation.panels import Drawing, Panel, colour, line
-from gpvo.files import replacing
+from gpvo.files import make_folder, refuse_foreign, replacing
+
+_SIGNED = ("png", "pdf", "svg", "eps", "ps")  # formats in which Matplotlib says that it drew them
 
 
 def picture(e: Evaluation, of: Drawing) -> Figure:
@@ -111,10 +113,12 @@ def forecast(f: Forecast, title: str) -> Figure:
 
 
 def require_picture(path: Path) -> None:
-    """Raise GpvoError where the name's ending is no format that can be drawn."""
+    """Raise GpvoError where the name's ending is no format that can be drawn, or the file there is no such drawing."""
     known = FigureCanvasBase.get_supported_filetypes()
     if path.suffix[1:].lower() not in known:
         raise GpvoError("does not have the suffix of an image", where=path, cure=f"choose from {', '.join(known)}")
+    if path.suffix[1:].lower() in _SIGNED:
+        refuse_foreign(path, b"atplotlib", "plot")
 
 
 def plot_fusion(traces: Sequence[Trace], path: Path) -> None:
@@ -133,7 +137,6 @@ def plot_fusion(traces: Sequence[Trace], path: Path) -> None:
         panels.panel(about, "time [s]", "position error [m]", errors),
         _innovations(traces),
     )
-    path.parent.mkdir(parents=True, exist_ok=True)
     save(figure_of(drawn, (11, 9)), path, dpi=120, bbox_inches="tight")
 
 
@@ -154,5 +157,6 @@ def _innovations(traces: Sequence[Trace]) -> Panel:
 
 def save(figure: Figure, path: Path, **options: Any) -> None:
     """Write to an image file, whole or not at all; ``options``: of matplotlib's ``savefig``."""
+    make_folder(path.parent)
     with replacing(path) as temporary:
         figure.savefig(temporary, format=path.suffix[1:].lower(), **options)

@@ -79,10 +79,10 @@ class Predictor:
         """From a model file. Raises ModelError, in one line, if the file cannot be used."""
         if not Path(path).exists():
             raise ModelError("no such model file", where=path, cure="'gpvo train RUN... -o MODEL' makes one")
-        arrays, header = modelfile.load(path)
+        blob = modelfile.read(path)  # once: the file may be replaced meanwhile, and the digest is that of these arrays
+        arrays, header = modelfile.parse(blob, path)
         try:
-            digest = hashlib.sha256(Path(path).read_bytes()).hexdigest()
-            return cls(arrays, header, digest)
+            return cls(arrays, header, hashlib.sha256(blob).hexdigest())
         except GpvoError as problem:
             raise ModelError(problem.what, where=Path(path), cure=problem.cure or "train the model again") from None
 

@@ -322,3 +322,14 @@ def test_a_run_that_states_nothing_of_motions_is_told_with_the_files_for_score(c
     assert code == 0
     assert "slam states no covariance of single motions" in err
     assert [p.name for p in (tmp_path / "stated").iterdir()] == ["truth"]
+
+
+def test_a_report_replaces_an_earlier_one_and_nothing_else(capsys, run_folder, tmp_path):
+    page = tmp_path / "report.html"
+    page.write_text("<!doctype html><title>gpvo, as I see it</title>")
+    before = page.read_bytes()
+    code, out, err = _main(capsys, "report", run_folder, "-o", page)
+    assert (code, out, page.read_bytes()) == (2, "", before)
+    assert "report.html: is another file, not an earlier report" in err.splitlines()[0]
+    page.unlink()
+    assert [_main(capsys, "report", run_folder, "-o", page)[0] for _ in range(2)] == [0, 0]

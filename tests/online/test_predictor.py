@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import copy
+import hashlib
 import pickle
 import subprocess
 import sys
@@ -15,6 +16,7 @@ from gpvo.dataset.build import build
 from gpvo.errors import GpvoError, ModelError
 from gpvo.geometry import se3
 from gpvo.geometry.covariance import is_positive_definite
+from gpvo.online import modelfile
 from gpvo.online.division import divide, ln_faster
 from gpvo.online.guard import AdaptiveScale
 from gpvo.online.observer import Observer, joined
@@ -430,3 +432,19 @@ def test_a_status_may_be_given_as_text(flight):
     assert record.status is Status.LOST
     with pytest.raises(ValueError, match="'fine' is not a valid Status"):
         replace(record, status="fine")
+
+
+def test_the_digest_is_that_of_the_arrays_that_were_read(tmp_path, monkeypatch):
+    """Also where the file is replaced meanwhile, as by a training that ends."""
+    path, trained = tmp_path / "m.gpvo", small_model()
+    modelfile.save(path, trained.arrays, trained.header)
+    ours = hashlib.sha256(path.read_bytes()).hexdigest()
+    check = modelfile._check_document
+
+    def replaced(*given):
+        modelfile.save(path, trained.arrays, {**trained.header, "note": "another"})
+        check(*given)
+
+    monkeypatch.setattr(modelfile, "_check_document", replaced)
+    assert Predictor.load(path).digest == ours
+    assert hashlib.sha256(path.read_bytes()).hexdigest() != ours
