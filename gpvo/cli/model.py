@@ -17,7 +17,7 @@ from gpvo.io.parquet import write_table
 from gpvo.io.run import read_run, write_predictions
 from gpvo.io.run_folder import FILES
 from gpvo.online.predictor import Predictor
-from gpvo.types import Prediction
+from gpvo.types import StoredPredictions
 
 if TYPE_CHECKING:
     from gpvo.evaluation.forecast import Forecast
@@ -52,7 +52,7 @@ def predict(
         for path, name in zip(runs, distinct([r.resolve().name for r in runs]), strict=True):
             run = read_run(path)
             warn_of_misfits(model, predictor, run)
-            predictions = list(predictor.replay(run.log).values())
+            predictions = predictor.replay(run.log).stored
             target = out if len(runs) == 1 else out / f"{name}.parquet"
             if target.exists() and target.name in FILES and target.name != "predictions.parquet":
                 raise GpvoError("is part of a run, not a file of predictions", where=target, cure="choose another -o")
@@ -71,12 +71,12 @@ def predict(
         print(f"median sigma: {length:.3g} mm, {angle:.3g} mrad {per}")
 
 
-def _summary(predictions: list[Prediction]) -> dict[str, Any]:
-    moving = [p for p in predictions if p.dt_s > 0 and p.status.severity < 2]
-    sigma = np.median([p.sigma for p in moving], axis=0) if moving else np.full(6, np.nan)
+def _summary(predictions: StoredPredictions) -> dict[str, Any]:
+    told = [(p.sigma, p.in_domain > 0.5) for p in predictions if p.dt_s > 0 and p.status.severity < 2]
+    sigma = np.median([s for s, _ in told], axis=0) if told else np.full(6, np.nan)
     return {
         "predictions": len(predictions),
-        "in_domain": float(np.mean([p.in_domain > 0.5 for p in moving])) if moving else None,
+        "in_domain": float(np.mean([inside for _, inside in told])) if told else None,
         "median_sigma": {"translation_m": sigma[:3], "rotation_rad": sigma[3:]},
     }
 

@@ -248,7 +248,7 @@ def aligned_truth(log: VoLog, truth: TruthLog, align: str) -> TruthLog:
     return replace(truth, T_world_cam=align_frames(flag_slips(log), truth, align).in_log_frame(truth.T_world_cam))
 
 
-def predictions_of(run: Run, predictor: Predictor | None) -> dict[int, Prediction]:
+def predictions_of(run: Run, predictor: Predictor | None) -> Mapping[int, Prediction]:
     """By time stamp, what a model predicts of the motions of a run, or without one what is stored with the run.
 
     Raises ModelError where the model predicts something else than the error of a motion.

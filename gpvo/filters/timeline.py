@@ -45,12 +45,6 @@ class Step:
     nominal: Nominal
     covariance: Array
 
-    def of_member(self, b: int) -> Step:
-        """What it did to one member."""
-        innovation = None if self.innovation is None else self.innovation.of_member(b)
-        outcome = self.outcome if innovation is None else _outcome(innovation)
-        return Step(self.t_ns, outcome, innovation, self.nominal.of_member(b), self.covariance[b : b + 1])
-
 
 @dataclass(frozen=True)
 class _Entry:
@@ -65,8 +59,9 @@ class _Entry:
     wait: Wait
 
 
-def _outcome(innovation: Innovation) -> str:
-    return "used" if innovation.passed.all() else "rejected"
+def outcome_of(outcome: str, passed: bool) -> str:
+    """Of a member that did or did not pass the gate, where the ``outcome`` is that of all members together."""
+    return ("used" if passed else "rejected") if outcome in ("used", "rejected") else outcome
 
 
 class Timeline:
@@ -239,7 +234,7 @@ class Timeline:
                 self.filter, innovation = unmoved, other
                 self.counts["clock_set_ahead"] += 1
         self.counts["recovered"] += int((recover & ~innovation.passed).any())
-        return _outcome(innovation), innovation
+        return outcome_of("used", bool(innovation.passed.all())), innovation
 
     def _remember(self, record: VoRecord, noise: MotionError | None) -> None:
         if self._history_ns <= 0:

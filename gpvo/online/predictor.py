@@ -22,7 +22,7 @@ from gpvo.online.estimate import ErrorModel
 from gpvo.online.guard import DEGRADED_BELOW, AdaptiveScale, camera_problems
 from gpvo.online.observer import Observer
 from gpvo.online.stored import arrays_of_base
-from gpvo.types import Array, Prediction, Status, StereoCamera, Vehicle, VoLog, VoRecord
+from gpvo.types import Array, ByStamp, Prediction, Status, StereoCamera, Vehicle, VoLog, VoRecord
 
 MODEL_SCHEMA = 1
 """Of the arrays and header keys described in :mod:`gpvo.online.modelfile`."""
@@ -119,10 +119,10 @@ class Predictor:
             )
         return self
 
-    def replay(self, log: VoLog) -> dict[int, Prediction]:
+    def replay(self, log: VoLog) -> ByStamp:
         """Predictions for a recorded run, by time stamp and in order; starts afresh with its camera."""
         self.reset(log.camera, vehicle=log.vehicle)
-        return {p.t_ns: p for p in map(self.step, log) if p is not None}
+        return ByStamp.of(p for p in map(self.step, log) if p is not None)
 
     def predict(
         self, features: ArrayLike, geometry: ArrayLike | None = None, dt_s: ArrayLike | None = None
