@@ -132,7 +132,7 @@ class StoredPredictions(Columns[Prediction]):
         """Predictions as they come: a thousand at a time are objects."""
         if isinstance(predictions, StoredPredictions):
             return predictions
-        coming, parts = iter(predictions), []
+        coming, parts = iter(predictions), list[StoredPredictions]()
         while (some := list(islice(coming, _AT_ONCE))) or not parts:
             columns = {f.name: [getattr(p, f.name) for p in some] for f in fields(Prediction)}
             columns["persistent_root"] = [_wide(root, 0.0) for root in columns["persistent_root"]]

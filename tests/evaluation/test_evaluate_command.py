@@ -333,3 +333,35 @@ def test_a_report_replaces_an_earlier_one_and_nothing_else(capsys, run_folder, t
     assert "report.html: is another file, not an earlier report" in err.splitlines()[0]
     page.unlink()
     assert [_main(capsys, "report", run_folder, "-o", page)[0] for _ in range(2)] == [0, 0]
+
+
+def test_the_offset_that_evaluate_advises_is_an_option_of_train(capsys, tmp_path):
+    """Of a truth on another clock, with it, a model is that of the truth on the log's, to the bit."""
+    late_s, models = 0.25, {}
+    for k, by_s in enumerate((0.0, late_s)):
+        log, truth = synthetic_run(4, n=300)
+        truth = replace(truth, t_ns=truth.t_ns + round(by_s * 1e9))
+        write_run(tmp_path / str(k) / "run", log, truth=truth)
+    advice = _main(capsys, "evaluate", tmp_path / "1" / "run")[1]
+    assert "with --time-offset auto" in advice
+    for name, run, offset in (("own", "0", "0"), ("late", "1", str(late_s)), ("auto", "1", "auto")):
+        given = (tmp_path / run / "run", "--time-offset", offset, "-o", tmp_path / f"{name}.gpvo")
+        code, _, err = _main(capsys, "train", *given)
+        assert (code, "contradict" in err) == (0, False)
+        models[name], header = modelfile.load(tmp_path / f"{name}.gpvo")
+        assert header["config"].get("time_offset_s", 0.0) == {"own": 0.0, "late": late_s, "auto": None}[name]
+    assert models["own"].keys() == models["late"].keys()
+    for name, array in models["own"].items():
+        np.testing.assert_array_equal(array, models["late"][name])
+    np.testing.assert_allclose(
+        models["auto"]["method.constant"], models["own"]["method.constant"], rtol=0.05, atol=1e-7
+    )
+
+
+def test_an_offset_that_nothing_tells_names_the_run(capsys, tmp_path):
+    log, truth = synthetic_run(4, n=40)
+    write_run(tmp_path / "short", log, truth=truth)
+    for command in (["evaluate"], ["train", "-o", tmp_path / "m.gpvo"]):
+        code, out, err = _main(capsys, *command, tmp_path / "short", "--time-offset", "auto")
+        assert (code, out, len(err.splitlines())) == (2, "", 1)
+        assert "short: the log lasts 2.00 s" in err
