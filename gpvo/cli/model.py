@@ -68,7 +68,8 @@ def predict(
         inside = 100 * (d["in_domain"] or 0)
         print(f"{d['file']}: {d['predictions']} predictions, {inside:.0f} % inside the training domain")
         length, angle = (1e3 * sum(x**2 for x in sigma) ** 0.5 for sigma in d["median_sigma"].values())
-        print(f"median sigma: {length:.3g} mm, {angle:.3g} mrad {per}")
+        known = f"median sigma: {length:.3g} mm, {angle:.3g} mrad {per}"
+        print("no motion was measured" if d["in_domain"] is None else known)
 
 
 def _summary(predictions: StoredPredictions) -> dict[str, Any]:

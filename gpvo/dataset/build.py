@@ -152,11 +152,12 @@ def build(
     if odd == "drop":
         known &= ~is_odd
     if known.sum() < MIN_ROWS:
-        raise GpvoError(
-            f"only {int(known.sum())} motions have ground truth, {MIN_ROWS} are needed",
-            where=where or name,
-            cure="check that log and truth share one clock",
-        )
+        what = f"only {int(known.sum())} motions have ground truth, {MIN_ROWS} are needed"
+        cure = "check that log and truth share one clock"
+        if (measured := int(seen.usable.sum())) < MIN_ROWS:
+            what = f"only {measured} of {max(len(log) - 1, 0)} motions were measured, {MIN_ROWS} are needed"
+            cure = "give a longer sequence, or one in which odometry is lost less often"
+        raise GpvoError(what, where=where or name, cure=cure)
     kept = seen.rows(known)
     n_lost, slips, jumps = lost_of(log)
     as_if, has = motion_targets([replace(r, status=Status.OK) for r in slips], truth)

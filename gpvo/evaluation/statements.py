@@ -99,7 +99,16 @@ def plain_statement(log: VoLog, method: str, covariance: Array) -> Statement:
     filled = covariance
     if not vouched.all():
         filled = np.concatenate([np.eye(6)[None] * 1e-6, covariance])[np.maximum.accumulate(vouched)]
-    return Statement(method, mean, covariance, _Rows(MotionError.independent(filled, dt_s=log.column("dt_s"))))
+    none = np.zeros((len(log), 6, 0)), np.zeros(0)
+    errors = MotionError(
+        mean=mean,
+        jitter=np.broadcast_to(0.0, filled.shape),
+        white=filled,
+        persistent_root=none[0],
+        persistent_tau_s=none[1],
+        dt_s=log.column("dt_s"),
+    )
+    return Statement(method, mean, covariance, _Rows(errors))
 
 
 @dataclass(frozen=True)

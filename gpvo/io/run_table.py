@@ -147,7 +147,8 @@ def prediction_columns(predictions: Iterable[Prediction]) -> Columns:
     ``calibration_tau_*_s`` besides; ``nu`` where the tails are heavier than a Gaussian's.
     """
     of = StoredPredictions.of(predictions).columns
-    errors = MotionError(**{f.name: of[f.name] for f in fields(MotionError) if f.name not in ("status", "nu")})
+    told: dict[str, Any] = {f.name: of[f.name] for f in fields(MotionError) if f.name not in ("status", "nu")}
+    errors = MotionError(**told)
     out: Columns = {name: of[name] for name in ("t_ns", "dt_s")}
     out["status"] = [status.value for status in of["status"]]
     out |= {name: of[name] for name in ("confidence", "in_domain")}

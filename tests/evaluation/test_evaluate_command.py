@@ -365,3 +365,21 @@ def test_an_offset_that_nothing_tells_names_the_run(capsys, tmp_path):
         code, out, err = _main(capsys, *command, tmp_path / "short", "--time-offset", "auto")
         assert (code, out, len(err.splitlines())) == (2, "", 1)
         assert "short: the log lasts 2.00 s" in err
+
+
+@pytest.mark.parametrize("lost", [False, True], ids=["short", "lost throughout"])
+def test_what_no_run_so_short_or_lost_can_tell_is_said_of_it(capsys, tmp_path, lost):
+    log, truth = make_run(200 if lost else 12, lost=set(range(1, 201)) if lost else set())
+    write_run(tmp_path / "run", log, truth=truth)
+    code, out, err = _main(capsys, "train", tmp_path / "run", "-o", tmp_path / "m.gpvo")
+    assert (code, out, len(err.splitlines())) == (2, "", 1)
+    of = "0 of 200" if lost else "12 of 12"
+    assert f"run: only {of} motions were measured, 30 are needed (give a longer sequence" in err
+    save_model(small_model(), tmp_path / "m.gpvo")
+    code, out, _ = _main(capsys, "predict", tmp_path / "m.gpvo", tmp_path / "run", "-o", tmp_path / "p.parquet")
+    assert (code, "nan" in out, "no motion was measured" in out) == (0, False, lost)
+    code, out, err = _main(capsys, "calibration", tmp_path / "run")
+    assert (code, out, len(err.splitlines())) == (2, "", 1)
+    assert "run: holds no calibration state (gpvo run estimates one" in err
+    code, out, err = _main(capsys, "score", tmp_path / "none")
+    assert (code, out, err) == (2, "", f"gpvo: {tmp_path / 'none'}: no such file or folder\n")
