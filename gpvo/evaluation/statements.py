@@ -3,13 +3,11 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
-from functools import cached_property
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from gpvo.geometry import se3
 from gpvo.geometry.covariance import where_stated
@@ -99,31 +97,29 @@ def plain_statement(log: VoLog, method: str, covariance: Array) -> Statement:
     filled = covariance
     if not vouched.all():
         filled = np.concatenate([np.eye(6)[None] * 1e-6, covariance])[np.maximum.accumulate(vouched)]
-    none = np.zeros((len(log), 6, 0)), np.zeros(0)
-    errors = MotionError(
-        mean=mean,
-        jitter=np.broadcast_to(0.0, filled.shape),
-        white=filled,
-        persistent_root=none[0],
-        persistent_tau_s=none[1],
-        dt_s=log.column("dt_s"),
+    dt_s = log.column("dt_s")
+    return Statement(
+        method,
+        mean,
+        covariance,
+        _Rows(lambda k: MotionError.independent(filled[k], dt_s=float(dt_s[k])), len(log)),
     )
-    return Statement(method, mean, covariance, _Rows(errors))
 
 
 @dataclass(frozen=True)
 class _Rows(Sequence[MotionError]):
-    """The errors of a batch, each made when it is asked for: as objects, those of a long run would fill the memory."""
+    """N errors, each ``made`` when it is asked for: as objects, those of a long run would fill the memory."""
 
-    batch: MotionError
+    made: Callable[[int], MotionError]
+    n: int
 
     def __len__(self) -> int:
-        return len(self.batch.mean)
+        return self.n
 
     def __getitem__(self, k: Any) -> Any:
-        if not -len(self) <= k < len(self):
+        if not -self.n <= k < self.n:
             raise IndexError(k)
-        return self.batch.row(k)
+        return self.made(k)
 
 
 def _translation_alone(log: VoLog, method: str) -> Array:
@@ -133,47 +129,23 @@ def _translation_alone(log: VoLog, method: str) -> Array:
     return where_stated(np.swapaxes(R, 1, 2) @ log.v_t(method) @ R)
 
 
-@dataclass(frozen=True)
-class _Held(Sequence[MotionError]):
-    """What is predicted of each motion of a log, or of the last one before it of which anything ``is_stated`` (N,);
-    made when it is asked for."""
-
-    predictions: Mapping[int, Prediction]
-    log: VoLog
-    is_stated: NDArray[np.bool_]
-
-    @cached_property
-    def _source(self) -> list[int | None]:
-        """(N,) stamps of what stands for each motion."""
-        k = np.maximum.accumulate(np.where(self.is_stated, np.arange(len(self.log)), -1))
-        t_ns = self.log.t_ns.tolist()
-        return [None if i < 0 else t_ns[i] for i in k.tolist()]
-
-    @cached_property
-    def _told(self) -> list[tuple[float, Status, bool]]:
-        return list(zip(self.log.column("dt_s").tolist(), self.log.statuses, self.is_stated.tolist()))
-
-    def __len__(self) -> int:
-        return len(self.log)
-
-    def __getitem__(self, k: Any) -> Any:
-        source, (dt_s, status, is_own) = self._source[k], self._told[k]
-        held = _ANY if source is None else self.predictions[source]
-        return replace(held, status=held.status if is_own else status, dt_s=dt_s or held.dt_s)
-
-
-_ANY = MotionError.independent(np.eye(6) * 1e-6)
-
-
 def predicted_statement(method: str, log: VoLog, predictions: Mapping[int, Prediction]) -> Statement:
     """What a model predicts, by stamp; a motion that it says nothing of is taken to be like the one before."""
     mean, covariance = np.zeros((len(log), 6)), np.full((len(log), 6, 6), np.nan)
-    is_stated = np.zeros(len(log), bool)
+    is_own = np.zeros(len(log), bool)
     for k, record in enumerate(log):
         prediction = predictions.get(record.t_ns)
         if prediction is not None and prediction.is_of(record) and record.status is not Status.START:
-            mean[k], covariance[k], is_stated[k] = prediction.mean, prediction.covariance, True
-    return Statement(method, mean, covariance, _Held(predictions, log, is_stated))
+            mean[k], covariance[k], is_own[k] = prediction.mean, prediction.covariance, True
+    source = np.maximum.accumulate(np.where(is_own, np.arange(len(log)), -1))
+    t_ns, dt_s, statuses = log.t_ns, log.column("dt_s"), log.statuses
+    nothing = MotionError.independent(np.eye(6) * 1e-6)
+
+    def held(k: int) -> MotionError:
+        error = nothing if source[k] < 0 else predictions[int(t_ns[source[k]])]
+        return replace(error, status=error.status if is_own[k] else statuses[k], dt_s=float(dt_s[k]) or error.dt_s)
+
+    return Statement(method, mean, covariance, _Rows(held, len(log)))
 
 
 def corrected(log: VoLog, mean: Array) -> Array:
