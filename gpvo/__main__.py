@@ -22,6 +22,8 @@ def main() -> None:
     """Run the command line; where it is not installed (``pip install --no-deps``), say so in one line."""
     # OpenCV reads this as it is loaded: a second guard behind the sizes that image headers state.
     os.environ.setdefault("OPENCV_IO_MAX_IMAGE_PIXELS", str(MAX_PIXELS))
+    # Arrow's own pool keeps what it once held; from the system's, NumPy uses it again.
+    os.environ.setdefault("ARROW_DEFAULT_MEMORY_POOL", "system")
     for name in ("stdout", "stderr"):
         if getattr(sys, name) is None:  # whoever started this has closed it
             setattr(sys, name, open(os.devnull, "w"))  # noqa: SIM115

@@ -90,6 +90,22 @@ def replacing(path: Path) -> Iterator[Path]:
         raise
 
 
+def refuse_foreign(path: Path, mark: bytes, what: str) -> None:
+    """Raise OutputError where ``path`` is a file without the ``mark`` that every ``what`` of gpvo bears in its first or
+    last megabyte: somebody's, which no output replaces."""
+    if not path.is_file():
+        return
+    try:
+        with path.open("rb") as file:
+            ends = file.read(_STEP_BYTES)
+            file.seek(max(0, os.fstat(file.fileno()).st_size - _STEP_BYTES))
+            ends += file.read()
+    except OSError as error:
+        raise OutputError(f"cannot be read: {error.strerror}", where=path) from None
+    if mark not in ends:
+        raise OutputError(f"is another file, not an earlier {what}", where=path, cure="choose another name")
+
+
 def make_folder(path: Path) -> Path:
     """The folder, made with those above it where it is missing. Raises OutputError where it cannot be made."""
     try:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import time
 from collections import Counter
 from collections.abc import Callable, Iterator, Mapping, Sequence
@@ -183,10 +184,19 @@ def _content(source: Source) -> list[object]:
     """What a source is known by: its files by name, size and time, its IMU, its truth, and its calibration, which may
     lie elsewhere and not show in the rectified camera."""
     path = Path(source.path)
-    files = [path] if path.is_file() else sorted(p for p in path.rglob("*") if p.is_file())
-    stats = ((p, p.stat()) for p in files)
+    stats = ((p, p.stat()) for p in ([path] if path.is_file() else _files(path)))
     known = [(str(p.relative_to(path.parent)), s.st_size, s.st_mtime_ns) for p, s in stats]
     return [source.format, known, source.imu, source.truth, source.calibration]
+
+
+def _files(folder: Path) -> list[Path]:
+    """All files below a folder, also behind links to folders, of which one may lead back."""
+    found, seen = list[Path](), set[str]()
+    for place, below, names in os.walk(folder, followlinks=True):
+        below[:] = [] if (real := os.path.realpath(place)) in seen else sorted(below)
+        found += [] if real in seen else [p for name in names if (p := Path(place, name)).is_file()]
+        seen.add(real)
+    return sorted(found)
 
 
 def imu_between(imu: ImuLog | None, t_from_ns: int, t_to_ns: int) -> ImuLog | None:

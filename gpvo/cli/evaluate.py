@@ -12,10 +12,10 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from gpvo.cli.common import refuse_twice
-from gpvo.cli.output import Json, cell, numbers, print_json, progress, say, show
+from gpvo.cli.output import Json, cell, numbers, print_json, progress, say, show, time_offset
 from gpvo.cli.twin import TWINS, Seed, TwinOptions, make_all, say_simulated
 from gpvo.errors import GpvoError
-from gpvo.files import in_metres
+from gpvo.files import in_metres, refuse_foreign
 from gpvo.io.run import Run, read_run
 from gpvo.io.source import open_source
 from gpvo.io.trajectory import read_tum
@@ -47,16 +47,14 @@ class JudgeOptions:
         """The flags, parsed."""
         from gpvo.evaluation.evaluate import EvaluateOptions
 
-        lengths, sigma, offset_s = None, None, None
+        lengths, sigma = None, None
         if self.segments is not None:
             lengths = tuple(numbers("--segments", self.segments, "give lengths above 0 in metres", least=1e-9))
         if self.truth_sigma is not None:
             cure = "give metres, or metres,radians"
             given = numbers("--truth-sigma", self.truth_sigma, cure, counts=(1, 2), least=0.0)
             sigma = (given[0], given[1] if len(given) == 2 else 0.0)
-        if self.time_offset != "auto":
-            (offset_s,) = numbers("--time-offset", self.time_offset, "give seconds, or auto", counts=(1,))
-        return EvaluateOptions(lengths, sigma, self.align, offset_s)
+        return EvaluateOptions(lengths, sigma, self.align, time_offset(self.time_offset))
 
 
 def evaluate(
@@ -134,6 +132,7 @@ def report(
 
     if sequence is not None and frames is None:
         raise GpvoError("--sequence has no effect without --frames", cure="add --frames, such as 5,80")
+    refuse_foreign(out, b"<title>gpvo report</title>", "report")  # before the work, not after it
     found = _evaluate(runs, judge, unjudged=True)
     pictures = [] if frames is None else _pictures(runs, frames, sequence)
     with progress("pages", 1):

@@ -12,6 +12,7 @@ import numpy as np
 from gpvo.cli import common as options
 from gpvo.cli.describe import as_lines, describe
 from gpvo.cli.output import Json, answer, note, numbers, one_of, progress
+from gpvo.cli.output import time_offset as read_offset
 from gpvo.dataset.clock import estimate_time_offset
 from gpvo.dataset.errors import interpolate_truth
 from gpvo.dataset.hand_eye import FixedTransform, align_frames
@@ -183,9 +184,7 @@ def import_(
 
     Example: gpvo import 00_est.txt --truth 00_gt.txt -o runs/kitti00
     """
-    offset, sigma = None, None
-    if time_offset != "auto":
-        (offset,) = numbers("--time-offset", time_offset, "give seconds, such as -0.02, or auto", counts=(1,))
+    offset, sigma = read_offset(time_offset), None
     if truth_sigma is not None:
         cure = "give metres,radians, such as 0.003,0.0002"
         translation, rotation = numbers("--truth-sigma", truth_sigma, cure, counts=(2,), least=0.0)

@@ -11,14 +11,15 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from gpvo.cli.common import is_given, refuse_twice
-from gpvo.cli.output import Json, cell, note, print_json, progress, say, show
+from gpvo.cli.output import Json, cell, note, print_json, progress, say, show, time_offset
 from gpvo.cli.twin import TwinOptions, Twins, in_place_of_runs_without_truth
 from gpvo.dataset.errors import made_from_odometry, motion_errors, outweighed_by_truth
 from gpvo.errors import GpvoError
-from gpvo.io.run import Run, read_run
+from gpvo.io.run import read_run
 from gpvo.io.run_read import read_meta
 
 if TYPE_CHECKING:
+    from gpvo.dataset.build import TrainingSet
     from gpvo.learning.config import TrainConfig
     from gpvo.learning.train import OnFit, TrainedModel
 
@@ -37,6 +38,7 @@ class TrainOptions:
     align: Annotated[str, "First fit between log and truth: a fixed rotation, transform (with lever arm) or none."] = (
         "none"
     )
+    time_offset_s: Annotated[str, "--time-offset", "Seconds to add to the logs' clock, or auto (for each)."] = "0"
     waits: Annotated[str, "--stationary", "--waits", "Motions where truth wanders at rest, or jumps: drop or keep."] = (
         "drop"
     )
@@ -72,7 +74,7 @@ def train(
     from gpvo.learning.store import check_writable, config_of, folds_path, save_model
 
     check_writable(out)
-    settings = asdict(options)
+    settings = asdict(options) | {"time_offset_s": time_offset(options.time_offset_s)}
     if update is not None:
         settings = asdict(config_of(update)) | {k: v for k, v in settings.items() if is_given(ctx, k)}
     settings |= {"jobs": jobs, "backend": backend, "scheduler": scheduler}
@@ -123,17 +125,18 @@ def _tell(trained: TrainedModel, settings: dict[str, Any], noisy: list[str]) -> 
         )
 
 
-def _each_once(paths: list[Path], config: TrainConfig, noisy: list[str]) -> Iterator[Run]:
-    """One run after the other, with a note if its poses or stamps, or those of its truth, seem not to be what they are
-    taken for; ``noisy`` gets the names of those whose truth cannot judge single motions."""
-    from gpvo.dataset.build import aligned_truth
+def _rows(paths: list[Path], config: TrainConfig, noisy: list[str]) -> Iterator[TrainingSet]:
+    """Of one run after the other, with a note if its poses or stamps, or those of its truth, seem not to be what they
+    are taken for; ``noisy`` gets the names of those whose truth cannot judge single motions."""
+    from gpvo.dataset.build import aligned
     from gpvo.dataset.misread import Misread, late_by
 
+    as_is = replace(config, align="none", time_offset_s=0.0)
     for path in paths:
-        run = read_run(path)
+        run = aligned(read_run(path), config.align, config.time_offset_s)[0]
         # A twin's truth is of the same frames and clock by construction.
         if run.truth is not None and len(run.truth.t_ns) > 1 and not run.meta.get("twin"):
-            truth = aligned_truth(run.log, run.truth, config.align)
+            truth = run.truth
             if late_by(run.log, truth) or Misread.of(run.log, truth).grossly:
                 note(
                     f"gpvo: odometry and truth of {path} contradict each other, and a model learns that as the"
@@ -144,7 +147,7 @@ def _each_once(paths: list[Path], config: TrainConfig, noisy: list[str]) -> Iter
                     f"gpvo: the truth of {path} seems to be made from odometry, as by closing loops: the model learns"
                     " hardly any noise from it"
                 )
-        yield run
+        yield as_is.rows_of(run)
         if config.target == "frame" and run.truth is not None and outweighed_by_truth(run.log, run.truth):
             noisy.append(run.name)
 
@@ -194,18 +197,18 @@ def _train(
         if len(paths) > 1 or update is not None:
             raise GpvoError("a file of training rows must be given alone", where=paths[0], cure="or give run folders")
         return store.train_stored(paths[0], config, on_fit=on_fit)
-    runs = _each_once(paths, config, noisy)
+    runs = _rows(paths, config, noisy)
     if config.target == "position":
-        return learning.train_position([config.rows_of(r) for r in runs], config)
+        return learning.train_position(list(runs), config)
     if update is not None:
         return store.update(update, runs, config, tell=lambda what: note(f"gpvo: {what}"), on_fit=on_fit)
     frames = (read_meta(p).get("frames") or 0 for p in paths if (p / "run.json").is_file())  # as the runs say
     if sum(map(int, frames)) > config.max_rows:
         # They do not fit into memory together: their rows pass through a file, one run at a time.
         with tempfile.TemporaryDirectory(prefix="gpvo-") as folder:
-            write_sets(rows := Path(folder) / "rows.parquet", map(config.rows_of, runs))
+            write_sets(rows := Path(folder) / "rows.parquet", runs)
             return store.train_stored(rows, config, on_fit=on_fit)
-    return learning.train(runs, config, on_fit=on_fit)
+    return learning.train_sets(list(runs), config, on_fit=on_fit)
 
 
 def _print_table(document: dict[str, Any]) -> None:

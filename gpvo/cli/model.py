@@ -12,12 +12,12 @@ import typer
 
 from gpvo.cli.output import Json, answer, print_json, progress, say, show
 from gpvo.errors import GpvoError
-from gpvo.files import make_folder, write_csv
+from gpvo.files import make_folder, refuse_foreign, write_csv
 from gpvo.io.parquet import write_table
 from gpvo.io.run import read_run, write_predictions
 from gpvo.io.run_folder import FILES
 from gpvo.online.predictor import Predictor
-from gpvo.types import Prediction
+from gpvo.types import StoredPredictions
 
 if TYPE_CHECKING:
     from gpvo.evaluation.forecast import Forecast
@@ -52,7 +52,7 @@ def predict(
         for path, name in zip(runs, distinct([r.resolve().name for r in runs]), strict=True):
             run = read_run(path)
             warn_of_misfits(model, predictor, run)
-            predictions = list(predictor.replay(run.log).values())
+            predictions = predictor.replay(run.log).stored
             target = out if len(runs) == 1 else out / f"{name}.parquet"
             if target.exists() and target.name in FILES and target.name != "predictions.parquet":
                 raise GpvoError("is part of a run, not a file of predictions", where=target, cure="choose another -o")
@@ -68,15 +68,16 @@ def predict(
         inside = 100 * (d["in_domain"] or 0)
         print(f"{d['file']}: {d['predictions']} predictions, {inside:.0f} % inside the training domain")
         length, angle = (1e3 * sum(x**2 for x in sigma) ** 0.5 for sigma in d["median_sigma"].values())
-        print(f"median sigma: {length:.3g} mm, {angle:.3g} mrad {per}")
+        known = f"median sigma: {length:.3g} mm, {angle:.3g} mrad {per}"
+        print("no motion was measured" if d["in_domain"] is None else known)
 
 
-def _summary(predictions: list[Prediction]) -> dict[str, Any]:
-    moving = [p for p in predictions if p.dt_s > 0 and p.status.severity < 2]
-    sigma = np.median([p.sigma for p in moving], axis=0) if moving else np.full(6, np.nan)
+def _summary(predictions: StoredPredictions) -> dict[str, Any]:
+    told = [(p.sigma, p.in_domain > 0.5) for p in predictions if p.dt_s > 0 and p.status.severity < 2]
+    sigma = np.median([s for s, _ in told], axis=0) if told else np.full(6, np.nan)
     return {
         "predictions": len(predictions),
-        "in_domain": float(np.mean([p.in_domain > 0.5 for p in moving])) if moving else None,
+        "in_domain": float(np.mean([inside for _, inside in told])) if told else None,
         "median_sigma": {"translation_m": sigma[:3], "rotation_rad": sigma[3:]},
     }
 
@@ -149,12 +150,16 @@ def forecast(
 
     if out is not None and out.suffix not in (".parquet", ".csv"):
         raise GpvoError("does not have the suffix of a table", where=out, cure="end it in .parquet or .csv")
+    if out is not None:
+        refuse_foreign(out, b"cov_5_5", "forecast")
     if plot is not None:
         from gpvo.evaluation import plots
 
         plots.require_picture(plot)  # before the work, not after it
     predictor = Predictor.load(model).require_motions(model)
-    found = run_forecast(predictor, read_plan(path, predictor.model.dt_s, frame), draws=draws, seed=seed)
+    with progress("draws", draws) as advance:
+        plan = read_plan(path, predictor.model.dt_s, frame)
+        found = run_forecast(predictor, plan, draws=draws, seed=seed, on_draw=advance)
     if out is not None:
         (write_table if out.suffix == ".parquet" else write_csv)(out, _columns(found))
     if plot is not None:

@@ -109,6 +109,12 @@ def numbers(option: str, text: str, cure: str, *, counts: Sequence[int] = (), le
     return found
 
 
+def time_offset(text: str) -> float | None:
+    """The seconds of ``--time-offset``, None for ``auto``. Raises GpvoError for anything else."""
+    cure = "give seconds, such as -0.02, or auto"
+    return None if text == "auto" else numbers("--time-offset", text, cure, counts=(1,))[0]
+
+
 def cell(value: float | str | None, digits: int = 3) -> str:
     """A number as tables show it, a dash for an unknown one; text as it is."""
     if isinstance(value, str):

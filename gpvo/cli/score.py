@@ -8,7 +8,7 @@ from typing import Annotated, Any
 from gpvo.cli.common import refuse_twice
 from gpvo.cli.evaluate import JudgeOptions
 from gpvo.cli.output import Json, answer, cell, progress, say, show
-from gpvo.errors import GpvoError
+from gpvo.errors import GpvoError, SourceError
 
 
 def score(
@@ -33,6 +33,8 @@ def score(
 
     refuse_twice(stated)
     truth = truth or []
+    if missing := [path for path in (*stated, *truth) if not path.exists()]:
+        raise SourceError("no such file or folder", where=missing[0])
     options = JudgeOptions(truth_sigma=truth_sigma).options()
     if len(stated) == 1 and stated[0].is_dir() and not truth:
         with progress("folders", 1):

@@ -12,6 +12,7 @@ from typing import Any, TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
+from gpvo.dataset.clock import estimate_time_offset, on_clock_of_log
 from gpvo.dataset.doubtful import false_motions, in_waits, odd_stretches
 from gpvo.dataset.errors import motion_targets, position_targets, require_attitude
 from gpvo.dataset.hand_eye import align_frames, windowed_motions
@@ -148,11 +149,12 @@ def build(
     if odd == "drop":
         known &= ~is_odd
     if known.sum() < MIN_ROWS:
-        raise GpvoError(
-            f"only {int(known.sum())} motions have ground truth, {MIN_ROWS} are needed",
-            where=where or name,
-            cure="check that log and truth share one clock",
-        )
+        what = f"only {int(known.sum())} motions have ground truth, {MIN_ROWS} are needed"
+        cure = "check that log and truth share one clock"
+        if (measured := int(seen.usable.sum())) < MIN_ROWS:
+            what = f"only {measured} of {max(len(log) - 1, 0)} motions were measured, {MIN_ROWS} are needed"
+            cure = "give a longer sequence, or one in which odometry is lost less often"
+        raise GpvoError(what, where=where or name, cure=cure)
     kept = seen.rows(known)
     n_lost, slips, jumps = lost_of(log)
     as_if, has = motion_targets([replace(r, status=Status.OK) for r in slips], truth)
@@ -214,12 +216,13 @@ def lost_of(log: VoLog) -> tuple[int, list[VoRecord], Array]:
     return n_lost, slips, np.array(jumps).reshape(-1, 6)
 
 
-def build_run(run: Run | str | Path, *, align: str = "none", **how: Any) -> TrainingSet:
-    """The training set of a run or its folder. ``align``: see :func:`aligned_truth`; ``how``: further arguments of
-    :func:`build`, as ``columns``, ``target``, ``waits`` and ``odd``."""
-    run = read_run(run)
-    truth = None if run.truth is None else aligned_truth(run.log, run.truth, align)
-    rows = build(run.log, truth, name=run.name, where=run.path, **how)
+def build_run(
+    run: Run | str | Path, *, align: str = "none", time_offset_s: float | None = 0.0, **how: Any
+) -> TrainingSet:
+    """The training set of a run or its folder. ``align``, ``time_offset_s``: see :func:`aligned`; ``how``: further
+    arguments of :func:`build`, as ``columns``, ``target``, ``waits`` and ``odd``."""
+    run = aligned(read_run(run), align, time_offset_s)[0]
+    rows = build(run.log, run.truth, name=run.name, where=run.path, **how)
     return replace(rows, odometry=that_matter(run.settings))
 
 
@@ -236,16 +239,30 @@ def that_matter(settings: Mapping[str, Any]) -> dict[str, Any]:
     return {name: list(v) if isinstance(v := known[name], tuple) else v for name in names}
 
 
-def aligned_truth(log: VoLog, truth: TruthLog, align: str) -> TruthLog:
-    """The truth as it is, with ``align`` "none"; else in the frame of the log, as motions of a second agree best
-    (:func:`gpvo.dataset.hand_eye.align_frames`). Raises GpvoError for another word, or where nothing tells it.
+def aligned(run: Run, align: str = "none", time_offset_s: float | None = 0.0) -> tuple[Run, float]:
+    """The run with its truth on the clock of the log, to whose stamps ``time_offset_s`` is added, and that offset; None
+    estimates it (:func:`gpvo.dataset.clock.estimate_time_offset`). Unless ``align`` is "none", also in the frame of the
+    log, as motions of a second agree best (:func:`gpvo.dataset.hand_eye.align_frames`). One without truth is as it is.
+
+    Raises GpvoError for another word, or where nothing tells it.
     """
-    if align == "none":
-        return truth
-    return replace(truth, T_world_cam=align_frames(flag_slips(log), truth, align).in_log_frame(truth.T_world_cam))
+    truth, offset_s = run.truth, time_offset_s
+    if truth is None:
+        return run, 0.0
+    try:
+        if offset_s is None:
+            offset_s = estimate_time_offset(run.log, truth)
+        if offset_s:
+            truth = on_clock_of_log(truth, offset_s)
+        if align != "none":
+            fixed = align_frames(flag_slips(run.log), truth, align)
+            truth = replace(truth, T_world_cam=fixed.in_log_frame(truth.T_world_cam))
+    except GpvoError as error:
+        raise GpvoError(error.what, where=run.path, cure=error.cure) from None
+    return replace(run, truth=truth), offset_s
 
 
-def predictions_of(run: Run, predictor: Predictor | None) -> dict[int, Prediction]:
+def predictions_of(run: Run, predictor: Predictor | None) -> Mapping[int, Prediction]:
     """By time stamp, what a model predicts of the motions of a run, or without one what is stored with the run.
 
     Raises ModelError where the model predicts something else than the error of a motion.

@@ -11,9 +11,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from gpvo.accumulation import along
-from gpvo.dataset.build import aligned_truth, predictions_of
+from gpvo.dataset.build import aligned, predictions_of
 from gpvo.dataset.check import check, predictor_of
-from gpvo.dataset.clock import estimate_time_offset, on_clock_of_log
+from gpvo.dataset.clock import on_clock_of_log
 from gpvo.dataset.doubtful import Stretch, jumps, odd_stretches, without_wandering_truth
 from gpvo.dataset.errors import (
     MAX_GAP_S,
@@ -253,15 +253,11 @@ def judged(log: VoLog, predictions: Mapping[int, Prediction]) -> VoLog:
 
 
 def _truth(run: Run, options: EvaluateOptions) -> tuple[TruthLog, float]:
+    run, offset_s = aligned(run, options.align, options.time_offset_s)
     if run.truth is None:
         cure = "give --truth FILE, TUM lines, or --twins for a run made with --keep-tracks"
         raise SourceError("has no ground truth", where=run.path, cure=cure)
-    truth, offset_s = run.truth, options.time_offset_s
-    if offset_s is None:
-        offset_s = estimate_time_offset(run.log, truth)
-    if offset_s:
-        truth = on_clock_of_log(truth, offset_s)
-    return aligned_truth(run.log, truth, options.align), float(offset_s)
+    return run.truth, offset_s
 
 
 def distinct(names: Sequence[str]) -> list[str]:

@@ -8,6 +8,7 @@ variance, the mean of their covariances: a model states no mean error that could
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -136,8 +137,15 @@ class Forecast:
         return float((self.in_domain < DEGRADED_BELOW).mean())
 
 
-def forecast(predictor: Predictor, plan: Plan, *, draws: int = DRAWS, seed: int = 0) -> Forecast:
-    """Fly the plan ``draws`` times in the conditions of training flights.
+def forecast(
+    predictor: Predictor,
+    plan: Plan,
+    *,
+    draws: int = DRAWS,
+    seed: int = 0,
+    on_draw: Callable[[], None] = lambda: None,
+) -> Forecast:
+    """Fly the plan ``draws`` times in the conditions of training flights; ``on_draw`` is called after each.
 
     Raises ModelError if the model predicts something else than the error of a motion, or keeps no sample of its
     training rows.
@@ -145,13 +153,17 @@ def forecast(predictor: Predictor, plan: Plan, *, draws: int = DRAWS, seed: int 
     predictor.require_motions()
     sample = TrainingSample.from_arrays(predictor.arrays, len(predictor.features))
     rng = np.random.default_rng(seed)
-    flown = [_fly(predictor, plan, sample, rng) for _ in range(draws)]
-    C, independent_m2 = (np.array(of_draws) for of_draws in zip(*(_sum_up(*f, plan) for f in flown), strict=True))
+    C, independent_m2, in_domain = np.zeros((len(plan.t_s), 6, 6)), 0.0, np.zeros(len(plan.t_s) - 1)
+    for _ in range(draws):
+        parent, said = _fly(predictor, plan, sample, rng)
+        covariance, alone_m2 = _sum_up(parent, said, plan)
+        C, independent_m2, in_domain = C + covariance, independent_m2 + alone_m2, in_domain + said.in_domain
+        on_draw()
     return Forecast(
         plan=plan,
-        covariance=symmetrise(C.mean(axis=0)),
-        independent_m=float(np.sqrt(independent_m2.mean())),
-        in_domain=np.mean(np.array([said.in_domain for _, said in flown]), axis=0),
+        covariance=symmetrise(C / draws),
+        independent_m=float(np.sqrt(independent_m2 / draws)),
+        in_domain=in_domain / draws,
         outside=_outside(predictor, plan),
         draws=draws,
     )

@@ -83,6 +83,7 @@ def fuse_runs(
     if unknown:
         raise GpvoError(f"unknown policy '{unknown[0]}'", cure=f"choose from {', '.join(known)}")
     predictor = None if settings.model is None else Predictor.load(settings.model).require_motions(settings.model)
+    tell("reading")
     runs = [read_run(path) for path in paths]
     if not settings.policies:
         imported = any(IMPORTED in run.log.methods for run in runs)
@@ -90,6 +91,7 @@ def fuse_runs(
     options = replace(settings.options, sigmas=start_sigmas(runs))
     flights, warnings = [], []
     for run, name in zip(runs, distinct([r.name for r in runs]), strict=True):
+        tell(f"{name}: predictions and checks")
         flights.append(replace(flight_of(run, predictor, use_imu=settings.use_imu), name=name))
         warnings += _findings(run, flights[-1], options)
         if (stating := predictor or predictor_of(run)) is not None:
@@ -203,10 +205,8 @@ def write_log(path: Path, fused: FusedRun) -> None:
     """A line per record: what was done with it, NIS, innovation and its standard deviation per axis (camera frame)."""
     header = ["t_ns", "outcome", "nis", *(f"innovation_{a}" for a in _AXES), *(f"sigma_{a}" for a in _AXES)]
     lines = [",".join(header)]
-    for t_ns, outcome, innovation in zip(fused.t_ns.tolist(), fused.outcomes, fused.innovations, strict=True):
-        values = [np.nan] * 13
-        if innovation is not None:
-            values = [innovation.nis[0], *innovation.residual[0], *np.sqrt(np.diagonal(innovation.S[0]))]
+    told = np.column_stack([fused.nis, fused.residual, fused.residual_sigma]).tolist()
+    for t_ns, outcome, values in zip(fused.t_ns.tolist(), fused.outcomes, told, strict=True):
         lines.append(",".join([str(t_ns), outcome, *(f"{v:.9g}" if np.isfinite(v) else "" for v in values)]))
     make_folder(path.parent)
     write_text(path, "\n".join(lines) + "\n", "ascii")

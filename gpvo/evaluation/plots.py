@@ -19,7 +19,9 @@ from gpvo.evaluation.evaluate import Evaluation
 from gpvo.evaluation.forecast import Forecast
 from gpvo.evaluation.fusion import Trace, nis_band, nis_over_runs
 from gpvo.evaluation.panels import Drawing, Panel, colour, line
-from gpvo.files import make_folder, replacing
+from gpvo.files import make_folder, refuse_foreign, replacing
+
+_SIGNED = ("png", "pdf", "svg", "eps", "ps")  # formats in which Matplotlib says that it drew them
 
 
 def picture(e: Evaluation, of: Drawing) -> Figure:
@@ -112,10 +114,12 @@ def forecast(f: Forecast, title: str) -> Figure:
 
 
 def require_picture(path: Path) -> None:
-    """Raise GpvoError where the name's ending is no format that can be drawn."""
+    """Raise GpvoError where the name's ending is no format that can be drawn, or the file there is no such drawing."""
     known = FigureCanvasBase.get_supported_filetypes()
     if path.suffix[1:].lower() not in known:
         raise GpvoError("does not have the suffix of an image", where=path, cure=f"choose from {', '.join(known)}")
+    if path.suffix[1:].lower() in _SIGNED:
+        refuse_foreign(path, b"atplotlib", "plot")
 
 
 def fusion(traces: Sequence[Trace]) -> Figure:

@@ -221,7 +221,8 @@ def write_left_out(trained: TrainedModel, runs: Sequence[Run], config: TrainConf
     from gpvo.learning.train import fold_model  # loads torch, which judging does without
 
     assert config.keep is not None
-    names, options = distinct([run.name for run in runs]), EvaluateOptions(align=config.align)
+    names = distinct([run.name for run in runs])
+    options = EvaluateOptions(align=config.align, time_offset_s=config.time_offset_s)
     folds = leave_one_out(trained.sets)
     for run, name, (held_out, others) in zip(runs, names, folds, strict=True):
         predictor = Predictor.load(fold_model(held_out, others, config, config.keep))

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Any
 
@@ -97,22 +97,29 @@ def plain_statement(log: VoLog, method: str, covariance: Array) -> Statement:
     filled = covariance
     if not vouched.all():
         filled = np.concatenate([np.eye(6)[None] * 1e-6, covariance])[np.maximum.accumulate(vouched)]
-    return Statement(method, mean, covariance, _Rows(MotionError.independent(filled, dt_s=log.column("dt_s"))))
+    dt_s = log.column("dt_s")
+    return Statement(
+        method,
+        mean,
+        covariance,
+        _Rows(lambda k: MotionError.independent(filled[k], dt_s=float(dt_s[k])), len(log)),
+    )
 
 
 @dataclass(frozen=True)
 class _Rows(Sequence[MotionError]):
-    """The errors of a batch, each made when it is asked for: as objects, those of a long run would fill the memory."""
+    """N errors, each ``made`` when it is asked for: as objects, those of a long run would fill the memory."""
 
-    batch: MotionError
+    made: Callable[[int], MotionError]
+    n: int
 
     def __len__(self) -> int:
-        return len(self.batch.mean)
+        return self.n
 
     def __getitem__(self, k: Any) -> Any:
-        if not -len(self) <= k < len(self):
+        if not -self.n <= k < self.n:
             raise IndexError(k)
-        return self.batch.row(k)
+        return self.made(k)
 
 
 def _translation_alone(log: VoLog, method: str) -> Array:
@@ -125,17 +132,20 @@ def _translation_alone(log: VoLog, method: str) -> Array:
 def predicted_statement(method: str, log: VoLog, predictions: Mapping[int, Prediction]) -> Statement:
     """What a model predicts, by stamp; a motion that it says nothing of is taken to be like the one before."""
     mean, covariance = np.zeros((len(log), 6)), np.full((len(log), 6, 6), np.nan)
-    errors: list[MotionError] = []
-    last = MotionError.independent(np.eye(6) * 1e-6)
+    is_own = np.zeros(len(log), bool)
     for k, record in enumerate(log):
         prediction = predictions.get(record.t_ns)
         if prediction is not None and prediction.is_of(record) and record.status is not Status.START:
-            mean[k], covariance[k] = prediction.mean, prediction.covariance
-            last = prediction
-        else:
-            last = replace(last, status=record.status)
-        errors.append(replace(last, dt_s=record.dt_s or last.dt_s))
-    return Statement(method, mean, covariance, errors)
+            mean[k], covariance[k], is_own[k] = prediction.mean, prediction.covariance, True
+    source = np.maximum.accumulate(np.where(is_own, np.arange(len(log)), -1))
+    t_ns, dt_s, statuses = log.t_ns, log.column("dt_s"), log.statuses
+    nothing = MotionError.independent(np.eye(6) * 1e-6)
+
+    def held(k: int) -> MotionError:
+        error = nothing if source[k] < 0 else predictions[int(t_ns[source[k]])]
+        return replace(error, status=error.status if is_own[k] else statuses[k], dt_s=float(dt_s[k]) or error.dt_s)
+
+    return Statement(method, mean, covariance, _Rows(held, len(log)))
 
 
 def corrected(log: VoLog, mean: Array) -> Array:

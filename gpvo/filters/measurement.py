@@ -21,7 +21,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from gpvo.accumulation import carry, from_start
-from gpvo.filters.propagation import TH, P, each, transpose
+from gpvo.filters.propagation import TH, P, transpose
 from gpvo.geometry import se3
 from gpvo.types import Array, MotionError
 
@@ -96,10 +96,6 @@ class Innovation:
     def surprise(self) -> Array:
         """(B,) minus twice the log of its likelihood, but for a constant."""
         return np.asarray(self.nis + np.linalg.slogdet(self.S)[1])
-
-    def of_member(self, b: int) -> Innovation:
-        """The same of one member."""
-        return each(self, lambda values: values[b : b + 1])
 
 
 def chi2_cdf(x: float, dof: int) -> float:

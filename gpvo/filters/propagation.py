@@ -61,10 +61,6 @@ class Nominal:
     acc_bias: Array
     gyro_bias: Array
 
-    def of_member(self, b: int) -> Nominal:
-        """That of one member, (1, ...)."""
-        return each(self, lambda values: values[b : b + 1])
-
     def copy(self) -> Nominal:
         """An independent copy."""
         return each(self, lambda values: values.copy())

@@ -32,16 +32,10 @@ class Step:
     nominal: Nominal
     covariance: Array
 
-    def of_member(self, b: int) -> Step:
-        """What it did to one member."""
-        innovation = None if self.innovation is None else self.innovation.of_member(b)
-        outcome = self.outcome if innovation is None else outcome_of(innovation)
-        return Step(self.t_ns, outcome, innovation, self.nominal.of_member(b), self.covariance[b : b + 1])
 
-
-def outcome_of(innovation: Innovation) -> str:
-    """What a measured motion is called by."""
-    return "used" if innovation.passed.all() else "rejected"
+def outcome_of(outcome: str, passed: bool) -> str:
+    """Of a member that did or did not pass the gate, where the ``outcome`` is that of all members together."""
+    return ("used" if passed else "rejected") if outcome in ("used", "rejected") else outcome
 
 
 @dataclass

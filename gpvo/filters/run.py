@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from typing import Literal, TypeVar
+from typing import Literal
 
 import numpy as np
 from numpy.typing import NDArray
@@ -12,23 +12,29 @@ from numpy.typing import NDArray
 from gpvo.errors import GpvoError
 from gpvo.filters import metrics
 from gpvo.filters.eskf import ErrorStateFilter
-from gpvo.filters.measurement import Gate, Innovation
+from gpvo.filters.measurement import Gate
 from gpvo.filters.plausible import usable
 from gpvo.filters.policies import Policy
-from gpvo.filters.propagation import DEFAULT_IMU_NOISE, TH, constant_velocity_noise, each
-from gpvo.filters.rivals import Step
+from gpvo.filters.propagation import DEFAULT_IMU_NOISE, TH, P, constant_velocity_noise, each
+from gpvo.filters.rivals import Step, outcome_of
 from gpvo.filters.start import Start, StartSigmas, from_rest, from_truth, tilt_of, vertical_in_world
 from gpvo.filters.timeline import Timeline
 from gpvo.geometry import se3
+from gpvo.geometry.covariance import from_upper, upper
 from gpvo.types import STANDARD_GRAVITY_MPS2, Array, ImuLog, Prediction, VoLog, VoRecord
 
-T = TypeVar("T")
+Progress = Callable[[str], None]
 
 # Truth whose vertical is measured further than this from +z, in sigmas, is in another frame: gravity is as measured.
 _LEVEL_SIGMAS = 3.0
 _NO_TRUTH = "use --twins for a run with tracks, gpvo import --truth for a log"
 _SHORTEST_PATH_M = 0.1  # of which a drift is a part
+_TOLD_EACH = 100  # records
 _IMU_MARGIN_NS = 100_000_000  # that an IMU log begins after or ends before the images is usual
+
+
+def no_progress(_: str) -> None:
+    """Of use where nobody wants to see any."""
 
 
 @dataclass(frozen=True)
@@ -99,21 +105,42 @@ class FuseOptions:
 
 @dataclass(frozen=True)
 class FusedRun:
-    """The filtered run of one policy at its n records: poses, core covariances, what became of each record with its
-    innovation (None where nothing was measured), counts and scores."""
+    """The filtered run of one policy at its n records, with counts and scores.
+
+    ``R_world_imu`` (n, 3, 3) and ``position`` (n, 3): the pose of the filter's state, ``covariance_upper`` (n, 45):
+    upper triangle of its covariance, ``T_imu_cam`` (4, 4). ``outcomes``: what became of each record; ``residual``,
+    ``residual_sigma`` (n, 6), ``nis`` (n,): its innovation, in the camera's axes, NaN where nothing was measured.
+    """
 
     name: str
     policy: str
     t_ns: NDArray[np.int64]
-    T_world_imu: Array
-    T_world_cam: Array
-    covariance: Array
+    R_world_imu: Array
+    position: Array
+    covariance_upper: Array
+    T_imu_cam: Array
     outcomes: Sequence[str]
-    innovations: Sequence[Innovation | None]
+    residual: Array
+    residual_sigma: Array
     nis: Array
     counts: Mapping[str, int]
     scores: metrics.Scores
     note: str = ""
+
+    @property
+    def T_world_imu(self) -> Array:
+        """(n, 4, 4) pose of the filter's state: the IMU, or the camera without one."""
+        return se3.from_rt(self.R_world_imu, self.position)
+
+    @property
+    def T_world_cam(self) -> Array:
+        """(n, 4, 4) pose of the camera."""
+        return self.T_world_imu @ self.T_imu_cam
+
+    @property
+    def covariance(self) -> Array:
+        """(n, 9, 9) of the error of position, velocity (world) and attitude (body)."""
+        return from_upper(self.covariance_upper, TH.stop)
 
 
 def begin(flight: Flight, options: FuseOptions) -> tuple[Start, Array | None]:
@@ -175,37 +202,78 @@ def make_filter(
     )
 
 
+@dataclass(frozen=True)
+class _Kept:
+    """What is kept of the steps at N records of B members: all of them would take 20 kB a record."""
+
+    pose: Array  # (N, B, 3, 4)
+    upper: Array  # (N, B, 45)
+    innovation: Array  # (N, B, 13): residual, its standard deviation, NIS
+    outcomes: list[str]
+    passed: NDArray[np.bool_]  # (N, B)
+
+    @classmethod
+    def empty(cls, n: int, batch: int) -> _Kept:
+        """Before the first step."""
+        innovation = np.full((n, batch, 13), np.nan)
+        return cls(
+            np.empty((n, batch, 3, 4)), np.empty((n, batch, 45)), innovation, [""] * n, np.ones((n, batch), bool)
+        )
+
+    def take(self, k: int, step: Step) -> None:
+        """The step of record k; a later one, of the same record put in its place again, replaces it."""
+        self.pose[k, :, :, :3], self.pose[k, :, :, 3] = step.nominal.R_world_imu, step.nominal.position
+        self.upper[k] = upper(step.covariance[:, : TH.stop, : TH.stop])
+        self.upper[k, ~np.isfinite(step.covariance).all(axis=(1, 2))] = np.nan
+        self.outcomes[k], self.innovation[k], self.passed[k] = step.outcome, np.nan, True
+        if (found := step.innovation) is not None:
+            self.innovation[k, :, :6] = found.residual
+            self.innovation[k, :, 6:12] = np.sqrt(np.diagonal(found.S, axis1=1, axis2=2))
+            self.innovation[k, :, 12], self.passed[k] = found.nis, found.passed
+
+
 def fuse_flight(
-    flight: Flight, policy: Policy, options: FuseOptions | None = None, *, batch: int = 1
+    flight: Flight,
+    policy: Policy,
+    options: FuseOptions | None = None,
+    *,
+    batch: int = 1,
+    progress: Progress = no_progress,
 ) -> list[FusedRun]:
     """Filter one run under one policy; one result per member (a policy may set several noises side by side)."""
-    timeline, start, steps = _fly(flight, policy, options or FuseOptions(), batch, lambda step: step)
-    return [_member(flight, policy.name, b, steps, timeline, start) for b in range(batch)]
+    kept = _Kept.empty(len(flight.records), batch)
+    timeline, start, rows = _fly(flight, policy, options or FuseOptions(), batch, kept.take, progress)
+    return [_member(flight, policy.name, b, kept, rows, timeline, start) for b in range(batch)]
 
 
-def ate_of_members(flight: Flight, policy: Policy, options: FuseOptions, *, batch: int) -> Array:
-    """(batch,) ATE [m] of the members of one filter, by the flight's truth.
-
-    Their positions are all that is kept: with its covariances, a member takes 5 kB a frame, 64 of them 30 GB an hour.
-    """
+def ate_of_members(
+    flight: Flight, policy: Policy, options: FuseOptions, *, batch: int, progress: Progress = no_progress
+) -> Array:
+    """(batch,) ATE [m] of the members of one filter, by the flight's truth. Their positions are all that is kept."""
     mount = np.eye(4) if flight.T_imu_cam is None else flight.T_imu_cam
+    estimate = np.empty((len(flight.records), batch, 3))
 
-    def position(step: Step) -> Array:
-        return np.array((se3.from_rt(step.nominal.R_world_imu, step.nominal.position) @ mount)[:, :3, 3])
+    def keep(k: int, step: Step) -> None:
+        T_world_imu = se3.from_rt(step.nominal.R_world_imu, step.nominal.position)
+        estimate[k] = (T_world_imu @ mount)[:, :3, 3]
 
-    steps = _fly(flight, policy, options, batch, position)[2]
-    t_ns = sorted(steps)
-    rows, valid = _rows_with_truth(flight, t_ns)
-    estimate = np.array([steps[t] for t in t_ns])[valid]
+    rows = _fly(flight, policy, options, batch, keep, progress)[2]
+    rows = rows if flight.truth_valid is None else rows[flight.truth_valid[rows]]
     assert flight.T_world_cam is not None
-    truth = flight.T_world_cam[rows][valid][:, :3, 3]
-    return np.array([metrics.ate_rmse(np.ascontiguousarray(estimate[:, b]), truth) for b in range(batch)])
+    truth = flight.T_world_cam[rows, :3, 3]
+    return np.array([metrics.ate_rmse(np.ascontiguousarray(estimate[rows, b]), truth) for b in range(batch)])
 
 
 def _fly(
-    flight: Flight, policy: Policy, options: FuseOptions, batch: int, kept: Callable[[Step], T]
-) -> tuple[Timeline, Start, dict[int, T]]:
-    """The filter at the end, its start, and what is kept of the step of each record, by stamp."""
+    flight: Flight,
+    policy: Policy,
+    options: FuseOptions,
+    batch: int,
+    keep: Callable[[int, Step], None],
+    progress: Progress,
+) -> tuple[Timeline, Start, NDArray[np.int64]]:
+    """The filter at the end, its start, and the records (n,) that made a step, by stamp; ``keep`` is given each with
+    its step, again where it is put in its place later."""
     start, gravity = begin(flight, options)
     rows = np.flatnonzero(flight.covered)
     rows = rows[rows >= flight.first]
@@ -218,56 +286,64 @@ def _fly(
         with_imu=flight.imu is not None,
         history_s=options.history_s,
     )
-    steps: dict[int, T] = {}
+    index = {t: i for i, t in enumerate(VoLog(flight.records).t_ns.tolist())}
+    done: dict[int, int] = {}
     imu = flight.imu
-    samples = iter(()) if imu is None else zip(imu.t_ns.tolist(), imu.gyro_radps, imu.acc_mps2)
-    for record in map(flight.records.__getitem__, rows.tolist()):
+    samples = iter(()) if imu is None else zip(imu.t_ns, imu.gyro_radps, imu.acc_mps2)
+    for k, record in enumerate(map(flight.records.__getitem__, rows.tolist())):
+        if k % _TOLD_EACH == 0:
+            progress(f"{flight.name}: frame {k} of {len(rows)}")
         while not timeline.reaches(record.t_ns) and (sample := next(samples, None)):
-            timeline.add_imu(*sample)
+            timeline.add_imu(int(sample[0]), *sample[1:])
         for step in timeline.add_vo(record, flight.predictions.get(record.t_ns)):
-            steps[step.t_ns] = kept(step)
-    return timeline, start, steps
+            done[step.t_ns] = index[step.t_ns]
+            keep(done[step.t_ns], step)
+    return timeline, start, np.array([done[t] for t in sorted(done)], dtype=np.int64)
 
 
 def _member(
-    flight: Flight,
-    policy: str,
-    b: int,
-    steps: Mapping[int, Step],
-    timeline: Timeline,
-    start: Start,
+    flight: Flight, policy: str, b: int, kept: _Kept, rows: NDArray[np.int64], timeline: Timeline, start: Start
 ) -> FusedRun:
-    t_ns = np.array(sorted(steps), dtype=np.int64)
-    ordered = [steps[int(t)].of_member(b) for t in t_ns]
-    nominal = [s.nominal for s in ordered]
-    T_imu = se3.from_rt(np.array([x.R_world_imu[0] for x in nominal]), np.array([x.position[0] for x in nominal]))
-    T_cam = T_imu if flight.T_imu_cam is None else T_imu @ flight.T_imu_cam
-    covariance = np.array([s.covariance[0] for s in ordered])
-    outcomes, innovations = [s.outcome for s in ordered], [s.innovation for s in ordered]
-    nis = np.array([np.nan if i is None else i.nis[0] for i in innovations])
-    failed = sum(1 for i in innovations if i is not None and not i.passed[0])
-    counts = {**timeline.counts, "rejected": failed}
-    found = (covariance, outcomes, innovations, nis, counts, metrics.without_truth(nis, failed), start.note)
-    run = FusedRun(flight.name, policy, t_ns, T_imu, T_cam, *found)
-    return replace(run, scores=_score(flight, run, start.world_tilt)) if flight.has_truth else run
+    # Views, where all records made a step in their order, as nearly always.
+    of = slice(None) if np.array_equal(rows, np.arange(len(flight.records))) else rows
+    pose, innovation, passed = kept.pose[:, b][of], kept.innovation[:, b][of], kept.passed[rows, b]
+    outcomes = [kept.outcomes[k] for k in rows.tolist()]
+    nis, failed = innovation[:, 12], int((~passed).sum())
+    run = FusedRun(
+        name=flight.name,
+        policy=policy,
+        t_ns=VoLog(flight.records).t_ns[rows],
+        R_world_imu=pose[:, :, :3],
+        position=pose[:, :, 3],
+        covariance_upper=kept.upper[:, b][of],
+        T_imu_cam=np.eye(4) if flight.T_imu_cam is None else flight.T_imu_cam,
+        outcomes=[outcome_of(o, p) for o, p in zip(outcomes, passed.tolist(), strict=True)],
+        residual=innovation[:, :6],
+        residual_sigma=innovation[:, 6:12],
+        nis=nis,
+        counts={**timeline.counts, "rejected": failed},
+        scores=metrics.without_truth(nis, failed),
+        note=start.note,
+    )
+    return replace(run, scores=_score(flight, run, rows, start.world_tilt)) if flight.has_truth else run
 
 
-def _score(flight: Flight, run: FusedRun, world_tilt: Array) -> metrics.Scores:
-    """The run's, and what the truth tells; ``world_tilt`` (3, 3), of the filter's vertical, turns all attitudes alike,
-    and positions about the start."""
-    rows, valid = _rows_with_truth(flight, run.t_ns.tolist())
+def _score(flight: Flight, run: FusedRun, rows: NDArray[np.int64], world_tilt: Array) -> metrics.Scores:
+    """The run's, and what the truth tells of its ``rows`` (n,); ``world_tilt`` (3, 3), of the filter's vertical, turns
+    all attitudes alike, and positions about the start."""
+    valid = np.ones(len(rows), bool) if flight.truth_valid is None else flight.truth_valid[rows]
     assert flight.T_world_cam is not None
     truth_cam, truth_imu = flight.T_world_cam[rows][valid], flight.T_world_imu[rows][valid]
-    est, imu = run.T_world_cam[valid], run.T_world_imu[valid]
+    est, imu, covariance = run.T_world_cam[valid], run.T_world_imu[valid], run.covariance[valid]
     error = np.linalg.norm(est[:, :3, 3] - truth_cam[:, :3, 3], axis=1)
     path = float(se3.path_length_m(truth_cam[:, :3, 3])[-1])
-    finite = np.asarray(np.isfinite(run.covariance).all(axis=(1, 2)) & (run.t_ns > run.t_ns[0]))[valid]
+    finite = np.isfinite(covariance).all(axis=(1, 2)) & (run.t_ns > run.t_ns[0])[valid]
     finite &= np.isfinite(imu).all(axis=(1, 2))
     own = [np.eye(3) * sigma**2 for sigma in flight.truth_sigma]
     lever, R = se3.skew(imu[finite, :3, 3] - run.T_world_imu[0, :3, 3]), imu[finite, :3, :3]
     own[0] = own[0] + lever @ world_tilt @ np.swapaxes(lever, 1, 2)
     own[1] = own[1] + np.swapaxes(R, 1, 2) @ world_tilt @ R
-    of_position, of_attitude = (run.covariance[valid, block, block][finite] for block in (slice(0, 3), TH))
+    of_position, of_attitude = (covariance[finite, block, block] for block in (P, TH))
     position = metrics.position_nees(imu[finite, :3, 3], truth_imu[finite, :3, 3], of_position + own[0])
     attitude = metrics.attitude_nees(imu[finite, :3, :3], truth_imu[finite, :3, :3], of_attitude + own[1])
     return replace(
@@ -280,10 +356,3 @@ def _score(flight: Flight, run: FusedRun, world_tilt: Array) -> metrics.Scores:
         diverged=metrics.diverged(error, path),
         frames=int(valid.sum()),
     )
-
-
-def _rows_with_truth(flight: Flight, t_ns: Sequence[int]) -> tuple[NDArray[np.int64], NDArray[np.bool_]]:
-    """The flight's records of these stamps (n,), and which of them have truth (n,)."""
-    index = {t: i for i, t in enumerate(VoLog(flight.records).t_ns.tolist())}
-    rows = np.array([index[t] for t in t_ns])
-    return rows, np.ones(len(rows), bool) if flight.truth_valid is None else np.asarray(flight.truth_valid)[rows]

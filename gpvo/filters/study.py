@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import textwrap
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 
@@ -25,11 +25,9 @@ from gpvo.filters.policies import (
     LearnedPolicy,
     Policy,
 )
-from gpvo.filters.run import Flight, FusedRun, FuseOptions, ate_of_members, fuse_flight
+from gpvo.filters.run import Flight, FusedRun, FuseOptions, Progress, ate_of_members, fuse_flight, no_progress
 from gpvo.stats.series import Interval, sequence_bootstrap
 from gpvo.types import Array, MotionError, Prediction, VoLog, VoRecord
-
-Progress = Callable[[str], None]
 
 # Variance factors tried for (translation, rotation): first these powers of four, then between the neighbours.
 _COARSE: Array = np.power(4.0, np.arange(-6, 2))
@@ -48,7 +46,7 @@ class Constants:
 
 
 def grid_scores(
-    flights: Sequence[Flight], constants: Constants, grid: Array, options: FuseOptions, progress: Progress | None = None
+    flights: Sequence[Flight], constants: Constants, grid: Array, options: FuseOptions, progress: Progress = no_progress
 ) -> Array:
     """Mean ATE [m] over runs (G,) of the constant times each pair of scalars in ``grid`` (G, 2).
 
@@ -57,9 +55,7 @@ def grid_scores(
     policy = ConstantPolicy(constants.mean_squares, constants.dt_s, grid)
     total = np.zeros(len(grid))
     for flight in flights:
-        if progress:
-            progress(flight.name)
-        total += ate_of_members(flight, policy, replace(options, history_s=0.0), batch=len(grid))
+        total += ate_of_members(flight, policy, replace(options, history_s=0.0), batch=len(grid), progress=progress)
     return np.where(np.isfinite(total), total / max(len(flights), 1), np.inf)
 
 
@@ -68,7 +64,7 @@ def fit_scalars(
     constants: Constants,
     options: FuseOptions | None = None,
     *,
-    progress: Progress | None = None,
+    progress: Progress = no_progress,
 ) -> tuple[float, float]:
     """One translation and one rotation scalar on the variances that minimise the mean ATE over ``flights``.
 
@@ -161,15 +157,13 @@ def study(
     options: FuseOptions | None = None,
     *,
     constants: Constants | None = None,
-    progress: Progress | None = None,
+    progress: Progress = no_progress,
     on_run: Callable[[Flight, FusedRun], None] | None = None,
 ) -> Study:
     """Filter every run under every policy; ``on_run`` sees each filtered run before it is reduced to scores."""
     scores: dict[str, list[Scores | None]] = {name: [] for name in policies}
     for flight in flights:
-        if progress:
-            progress(flight.name)
-        fused = fuse_side_by_side(flight, {name: p for name, p in policies.items() if p is not None}, options)
+        fused = fuse_side_by_side(flight, {name: p for name, p in policies.items() if p is not None}, options, progress)
         for name in policies:
             scores[name].append(fused[name].scores if name in fused else None)
             if on_run and name in fused:
@@ -219,18 +213,21 @@ def _cell(value: float, digits: int, width: int) -> str:
 
 @dataclass(frozen=True)
 class _SideBySide:
-    """The noises of several policies, one member each, by the records' stamps, which are the same."""
+    """The noises of several policies, one member each, all of which speak of the same records."""
 
-    noises: Sequence[Mapping[int, MotionError]]
+    policies: Sequence[Policy]
     name: str = "side by side"
 
     def noise(self, record: VoRecord, prediction: Prediction | None) -> MotionError | None:
-        found = [of_one[record.t_ns].row(0) for of_one in self.noises if record.t_ns in of_one]
+        found = [noise.row(0) for p in self.policies if (noise := p.noise(record, prediction)) is not None]
         return stacked(found) if found else None
 
 
 def fuse_side_by_side(
-    flight: Flight, policies: Mapping[str, Policy], options: FuseOptions | None = None
+    flight: Flight,
+    policies: Mapping[str, Policy],
+    options: FuseOptions | None = None,
+    progress: Progress = no_progress,
 ) -> dict[str, FusedRun]:
     """Filter one run under each policy (of one member) that speaks for at least half of its measured motions; results
     as if each had filtered alone.
@@ -239,35 +236,49 @@ def fuse_side_by_side(
     nothing to say about some records, or whose bias has other time constants, is filtered by itself.
     """
     usable = int(VoLog(flight.records).usable.sum())
-    found = {name: _noises(flight, policy) for name, policy in policies.items()}
-    stated = {name: noises for name, noises in found.items() if usable and 2 * len(noises) >= usable}
+    stated = {name: s for name, s in _stated(flight, policies).items() if usable and 2 * len(s.t_ns) >= usable}
     together = _alike(stated)
     out: dict[str, FusedRun] = {}
     if len(together) > 1:
-        fused = fuse_flight(flight, _SideBySide([stated[name] for name in together]), options, batch=len(together))
+        side_by_side = _SideBySide([policies[name] for name in together])
+        fused = fuse_flight(flight, side_by_side, options, batch=len(together), progress=progress)
         out = {name: replace(run, policy=name) for name, run in zip(together, fused, strict=True)}
     for name in stated:
         if name not in out:
-            out[name] = fuse_flight(flight, policies[name], options)[0]
+            out[name] = fuse_flight(flight, policies[name], options, progress=progress)[0]
     return out
 
 
-def _noises(flight: Flight, policy: Policy) -> dict[int, MotionError]:
-    usable = (r for r in flight.records if r.usable)
-    found = ((r.t_ns, policy.noise(r, flight.predictions.get(r.t_ns))) for r in usable)
-    return {t: noise for t, noise in found if noise is not None}
+@dataclass(frozen=True)
+class _Stated:
+    """Of which records a policy speaks, which of them it takes for lost, and the time constants of what persists."""
+
+    t_ns: set[int] = field(default_factory=set)
+    lost: set[int] = field(default_factory=set)
+    tau_s: set[bytes] = field(default_factory=set)
 
 
-def _alike(stated: Mapping[str, Mapping[int, MotionError]]) -> list[str]:
+def _stated(flight: Flight, policies: Mapping[str, Policy]) -> dict[str, _Stated]:
+    out = {name: _Stated() for name in policies}
+    for record in flight.records:
+        for name, policy in policies.items() if record.usable else ():
+            noise = policy.noise(record, flight.predictions.get(record.t_ns))
+            if noise is not None:
+                out[name].t_ns.add(record.t_ns)
+                out[name].lost.update([record.t_ns] if noise.lost else ())
+                out[name].tau_s.update([noise.persistent_tau_s.tobytes()] if len(noise.persistent_tau_s) else ())
+    return out
+
+
+def _alike(stated: Mapping[str, _Stated]) -> list[str]:
     """Policies that speak for all records that any speaks for, with one set of time constants and of lost motions."""
-    everything = {t for noises in stated.values() for t in noises}
+    everything = set[int]().union(*(s.t_ns for s in stated.values()))
     shared: set[tuple[bytes, frozenset[int]]] = set()
     names = []
-    for name, noises in stated.items():
+    for name, s in stated.items():
         # What a lost motion does not share is nothing to members whose motions share nothing.
-        lost = frozenset(t for t, n in noises.items() if n.lost)
-        own = {(n.persistent_tau_s.tobytes(), lost) for n in noises.values() if len(n.persistent_tau_s)}
-        if noises.keys() == everything and len(own | shared) <= 1:
+        own = {(tau_s, frozenset(s.lost)) for tau_s in s.tau_s}
+        if s.t_ns == everything and len(own | shared) <= 1:
             shared |= own
             names.append(name)
     return names

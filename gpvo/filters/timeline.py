@@ -292,7 +292,7 @@ class Timeline:
                 self.filter, innovation = unmoved, other
                 self.counts["clock_set_ahead"] += 1
         self.counts["recovered"] += int((recover & ~innovation.passed).any())
-        return outcome_of(innovation), innovation
+        return outcome_of("used", bool(innovation.passed.all())), innovation
 
     def _remember(self, t_ns: int, record: VoRecord, noise: MotionError | None) -> None:
         if self._history_ns <= 0:

@@ -209,9 +209,8 @@ def read_columns(path: Path) -> tuple[dict[str, NDArray[Any]], dict[str, str]]:
     Raises SourceError where the file is missing, damaged or implausibly large.
     """
     with _opened(path) as file:
-        table = file.read()
-        metadata = {k.decode(): v.decode(errors="replace") for k, v in (table.schema.metadata or {}).items()}
-        return _columns(table), metadata
+        metadata = {k.decode(): v.decode(errors="replace") for k, v in (file.schema_arrow.metadata or {}).items()}
+        return _columns(file.read()), metadata
 
 
 def read_blocks(path: Path) -> Iterator[dict[str, NDArray[Any]]]:
@@ -263,6 +262,8 @@ def _opened(path: Path) -> Iterator[pq.ParquetFile]:
     except (pa.ArrowException, OSError, ValueError) as error:
         reason = str(error).splitlines()[0] if str(error) else type(error).__name__
         raise SourceError(f"is damaged: {reason}", where=path, cure="run the sequence again") from None
+    finally:
+        pa.default_memory_pool().release_unused()  # kept, it would be twice what a run takes
 
 
 def _columns(table: pa.Table) -> dict[str, NDArray[Any]]:

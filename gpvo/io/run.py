@@ -13,7 +13,7 @@ import platform
 import shutil
 import time
 from collections import Counter, OrderedDict
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import asdict, dataclass, field, replace
 from datetime import datetime, timezone
 from pathlib import Path
@@ -272,7 +272,7 @@ def write_run(path: str | Path, log: VoLog, *, predictions: Sequence[Prediction]
             writer.append(record, by_stamp.get(record.t_ns))
 
 
-def write_predictions(path: str | Path, predictions: Sequence[Prediction]) -> None:
+def write_predictions(path: str | Path, predictions: Iterable[Prediction]) -> None:
     """Write predictions as a Parquet file of their own, as ``gpvo predict`` does."""
     write_table(Path(path), run_table.prediction_columns(predictions), {"schema": str(SCHEMA)})
 

@@ -20,6 +20,7 @@ from gpvo.io import run_table
 from gpvo.io.parquet import read_blocks, read_columns
 from gpvo.types import (
     Array,
+    ByStamp,
     ImuLog,
     ImuNoise,
     Mounting,
@@ -58,11 +59,10 @@ class Run:
     settings: dict[str, Any] = field(default_factory=dict)
 
     @property
-    def predictions_of_motions(self) -> dict[int, Prediction]:
+    def predictions_of_motions(self) -> ByStamp:
         """What is stored, by time stamp, but for predictions over windows of motions."""
-        stored = {p.t_ns: p for p in self.predictions}
-        found = ((r, stored.get(r.t_ns)) for r in self.log)
-        return {r.t_ns: p for r, p in found if p is not None and p.is_of(r)}
+        stored = ByStamp.of(self.predictions)
+        return stored.only(r.t_ns for r in self.log if r.t_ns in stored and stored[r.t_ns].is_of(r))
 
     def __str__(self) -> str:
         parts = [f"{len(self.log)} records"]

@@ -8,9 +8,9 @@ for x, y, z [m] and the rotations about x, y, z [rad]; ``vt_<method>_<i><j>`` is
 
 from __future__ import annotations
 
-import math
 import re
 from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import fields
 from typing import Any
 
 import numpy as np
@@ -24,6 +24,7 @@ from gpvo.types import (
     IMU_FIELDS,
     Array,
     ImuLog,
+    MotionError,
     Prediction,
     Status,
     StereoTracks,
@@ -139,30 +140,29 @@ def _objects(values: Iterable[Any], n: int) -> NDArray[Any]:
     return np.fromiter(values, dtype=object, count=n)
 
 
-def prediction_columns(predictions: Sequence[Prediction]) -> Columns:
+def prediction_columns(predictions: Iterable[Prediction]) -> Columns:
     """Predictions as columns: ``mean_*``, ``cov_total_<i><j>``, ``cov_<part>_<i><j>``, ``bias_tau_*_s``, ...
 
     ``cov_bias`` is all that persists. Of models with errors of calibration, ``root_calibration_<i><j>`` and
     ``calibration_tau_*_s`` besides; ``nu`` where the tails are heavier than a Gaussian's.
     """
-    out: Columns = {name: [getattr(p, name) for p in predictions] for name in ("t_ns", "dt_s")}
-    out["status"] = [p.status.value for p in predictions]
-    out |= {name: [getattr(p, name) for p in predictions] for name in ("confidence", "in_domain")}
-    if any(math.isfinite(p.nu) for p in predictions):
-        out["nu"] = [p.nu for p in predictions]
-    tau = [_wide(p.persistent_tau_s, 1.0) for p in predictions]
-    for i, axis in enumerate(_SIGMA6):
-        out[f"mean_{axis}"] = [p.mean[i] for p in predictions]
+    of = StoredPredictions.of(predictions).columns
+    told: dict[str, Any] = {f.name: of[f.name] for f in fields(MotionError) if f.name not in ("status", "nu")}
+    errors = MotionError(**told)
+    out: Columns = {name: of[name] for name in ("t_ns", "dt_s")}
+    out["status"] = [status.value for status in of["status"]]
+    out |= {name: of[name] for name in ("confidence", "in_domain")}
+    if np.isfinite(of["nu"]).any():
+        out["nu"] = of["nu"]
+    tau = of["persistent_tau_s"]
+    out |= {f"mean_{axis}": errors.mean[:, i] for i, axis in enumerate(_SIGMA6)}
     for i, axis in enumerate(_SHORT6):
-        out[f"epistemic_var_{axis}"] = [p.epistemic[i] for p in predictions]
-        out[f"bias_tau_{axis}_s"] = [t[i] for t in tau]
-    parts = ({"total": p.covariance, "jitter": p.jitter, "white": p.white, "bias": p.persistent} for p in predictions)
-    out |= _matrix_columns("cov", list(parts), _UPPER6)
-    if any((t[6:] != 1.0).any() for t in tau):
-        roots = [{"calibration": _wide(p.persistent_root, 0.0)[:, 6:]} for p in predictions]
-        out |= _matrix_columns("root", roots, _ALL6)
-        for i, axis in enumerate(_SHORT6):
-            out[f"calibration_tau_{axis}_s"] = [t[6 + i] for t in tau]
+        out |= {f"epistemic_var_{axis}": of["epistemic"][:, i], f"bias_tau_{axis}_s": tau[:, i]}
+    parts = {"total": errors.covariance, "jitter": errors.jitter, "white": errors.white, "bias": errors.persistent}
+    out |= {f"cov_{part}_{i}{j}": C[:, i, j] for part, C in parts.items() for i, j in _UPPER6}
+    if (tau[:, 6:] != 1.0).any():
+        out |= {f"root_calibration_{i}{j}": errors.persistent_root[:, i, 6 + j] for i, j in _ALL6}
+        out |= {f"calibration_tau_{axis}_s": tau[:, 6 + i] for i, axis in enumerate(_SHORT6)}
     return out
 
 
@@ -203,13 +203,6 @@ def predictions_from(columns: Mapping[str, NDArray[Any]]) -> StoredPredictions:
             "nu": np.asarray(columns.get("nu", np.full(n, np.inf)), dtype=np.float64),
         }
     )
-
-
-def _wide(persistent: Array, fill: float) -> Array:
-    """Roots (6, P) or time constants (P,) of what persists, filled up to 12 of them."""
-    out = np.full((*persistent.shape[:-1], 12), fill)
-    out[..., : persistent.shape[-1]] = persistent
-    return out
 
 
 def truth_columns(truth: TruthLog) -> dict[str, NDArray[Any]]:

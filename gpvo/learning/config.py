@@ -38,10 +38,11 @@ class TrainConfig:
 
     ``target``: ``frame``, ``window:1s``, ``length:1m`` or ``position``. ``regressor``, ``inducing``: of positions, the
     latter the points of its GP. ``align``: ``rotation`` or ``transform`` first fits that between each log and its
-    truth. ``waits``: ``drop`` leaves out waits in which the truth moves; ``odd`` does the same for stretches in which
-    odometry and truth differ far more than elsewhere. ``max_rows``: held in memory; the rest of larger files is
-    streamed. ``jobs``, ``backend`` (``local`` or ``dask``), ``scheduler``: where folds are fitted. ``keep``: folder for
-    finished folds, which an interrupted training does not fit again; None keeps none.
+    truth, to whose clock ``time_offset_s`` brings the log, None by an estimate. ``waits``: ``drop`` leaves out waits in
+    which the truth moves; ``odd`` does the same for stretches in which odometry and truth differ far more than
+    elsewhere. ``max_rows``: held in memory; the rest of larger files is streamed. ``jobs``, ``backend`` (``local`` or
+    ``dask``), ``scheduler``: where folds are fitted. ``keep``: folder for finished folds, which an interrupted training
+    does not fit again; None keeps none.
     """
 
     features: str = "auto"
@@ -49,6 +50,7 @@ class TrainConfig:
     regressor: str = "auto"
     seed: int = 0
     align: str = "none"
+    time_offset_s: float | None = 0.0
     waits: str = "drop"
     odd: str = "keep"
     inducing: int = 256
@@ -60,11 +62,15 @@ class TrainConfig:
 
     def settings(self) -> dict[str, Any]:
         """Those that determine the model, not where its folds are fitted and kept."""
-        return {k: v for k, v in asdict(self).items() if k not in ("jobs", "backend", "scheduler", "keep")}
+        left_out = ("jobs", "backend", "scheduler", "keep", *(["time_offset_s"] if self.time_offset_s == 0.0 else []))
+        return {k: v for k, v in asdict(self).items() if k not in left_out}
 
-    def rows_of(self, run: Run | str | Path) -> TrainingSet:
-        """The training set of a run, or of its folder, under these settings."""
-        return build_run(run, target=self.target, align=self.align, waits=self.waits, odd=self.odd)
+    def rows_of(self, run: TrainingSet | Run | str | Path) -> TrainingSet:
+        """The training set of a run, or of its folder, under these settings; one that is made already is returned."""
+        if isinstance(run, TrainingSet):
+            return run
+        how: dict[str, Any] = {k: getattr(self, k) for k in ("target", "align", "time_offset_s", "waits", "odd")}
+        return build_run(run, **how)
 
 
 def known_to_all(sets: Sequence[TrainingSet]) -> set[str]:

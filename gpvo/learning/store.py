@@ -81,7 +81,7 @@ def config_of(path: str | Path) -> TrainConfig:
 
 def update(
     path: str | Path,
-    runs: Iterable[Run],
+    runs: Iterable[Run | TrainingSet],
     config: TrainConfig,
     *,
     judge: bool = True,

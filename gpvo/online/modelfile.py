@@ -65,12 +65,21 @@ def save(path: str | os.PathLike[str], arrays: Mapping[str, NDArray[Any]], heade
 
 def load(path: str | os.PathLike[str]) -> tuple[dict[str, NDArray[Any]], dict[str, Any]]:
     """Arrays and header of a model file; ModelError (one line) if it is missing, damaged, truncated or too new."""
+    return parse(read(path), path)
+
+
+def read(path: str | os.PathLike[str]) -> bytes:
+    """The bytes of a model file, for :func:`parse`. Raises ModelError where it cannot be read."""
     path = Path(path)
-    if path.exists() and not path.is_file():  # a pipe cannot be read again, for its digest
+    if path.exists() and not path.is_file():  # a pipe cannot be read again, by the next that asks
         kind = "folder" if path.is_dir() else "pipe or a device"
         raise ModelError(f"is a {kind}, not a model file", where=path, cure="give one of gpvo train, before the run")
-    beyond = f"is larger than {MAX_FILE_BYTES} bytes: not a model file"
-    blob = read_bounded(path, MAX_FILE_BYTES, beyond, ModelError)
+    return read_bounded(path, MAX_FILE_BYTES, f"is larger than {MAX_FILE_BYTES} bytes: not a model file", ModelError)
+
+
+def parse(blob: bytes, path: str | os.PathLike[str]) -> tuple[dict[str, NDArray[Any]], dict[str, Any]]:
+    """Arrays and header of the bytes of the model file ``path``; raises as :func:`load`."""
+    path = Path(path)
     try:
         # Whatever the header declares is held against the bytes there are.
         arrays = _load_tensors(blob)

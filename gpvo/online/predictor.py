@@ -22,7 +22,7 @@ from gpvo.online.estimate import ErrorModel
 from gpvo.online.guard import DEGRADED_BELOW, AdaptiveScale, camera_problems
 from gpvo.online.observer import Observer
 from gpvo.online.stored import arrays_of_base
-from gpvo.types import Array, Prediction, Status, StereoCamera, Vehicle, VoLog, VoRecord
+from gpvo.types import Array, ByStamp, Prediction, Status, StereoCamera, Vehicle, VoLog, VoRecord
 
 MODEL_SCHEMA = 1
 """Of the arrays and header keys described in :mod:`gpvo.online.modelfile`."""
@@ -77,10 +77,10 @@ class Predictor:
         """From a model file. Raises ModelError, in one line, if the file cannot be used."""
         if not Path(path).exists():
             raise ModelError("no such model file", where=path, cure="'gpvo train RUN... -o MODEL' makes one")
-        arrays, header = modelfile.load(path)
+        blob = modelfile.read(path)  # once: the file may be replaced meanwhile, and the digest is that of these arrays
+        arrays, header = modelfile.parse(blob, path)
         try:
-            digest = hashlib.sha256(Path(path).read_bytes()).hexdigest()
-            return cls(arrays, header, digest)
+            return cls(arrays, header, hashlib.sha256(blob).hexdigest())
         except GpvoError as problem:
             raise ModelError(problem.what, where=Path(path), cure=problem.cure or "train the model again") from None
 
@@ -117,10 +117,10 @@ class Predictor:
             )
         return self
 
-    def replay(self, log: VoLog) -> dict[int, Prediction]:
+    def replay(self, log: VoLog) -> ByStamp:
         """Predictions for a recorded run, by time stamp and in order; starts afresh with its camera."""
         self.reset(log.camera, vehicle=log.vehicle)
-        return {p.t_ns: p for p in map(self.step, log) if p is not None}
+        return ByStamp.of(p for p in map(self.step, log) if p is not None)
 
     def predict(
         self, features: ArrayLike, geometry: ArrayLike | None = None, dt_s: ArrayLike | None = None

@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from gpvo.errors import GpvoError
-from gpvo.files import write_text
+from gpvo.files import refuse_foreign, write_text
 from gpvo.online.base import motion_noise, positions
 from gpvo.online.division import LEAST_LEFT
 from gpvo.online.estimate import DURATIONS_S, LEAST_VAR, LN_LARGEST, ErrorModel
@@ -23,7 +23,7 @@ from gpvo.publish.onnx import to_onnx
 
 SUFFIXES = {"onnx": ".onnx", "c": ".h"}
 FORMATS = tuple(SUFFIXES)
-_WRITTEN = {"onnx": b"\x12\x04gpvo", "c": b"written by gpvo"}  # stands in the first line, or as the producer
+_WRITTEN = {"onnx": b"\x12\x04gpvo", "c": b"written by gpvo"}  # near the top, or as the producer
 PREFIX = "gpvo"
 """Of every symbol, unless another is asked for."""
 _PER_LINE = 8
@@ -60,10 +60,7 @@ def export_model(model: Path, path: Path, to: str, *, prefix: str = PREFIX) -> N
     a prefix that is no C identifier, a bad file, or where ``path`` holds anything but an earlier export.
     """
     to = format_of(to, path)
-    if path.is_file():
-        with path.open("rb") as file:
-            if _WRITTEN[to] not in file.read(100):
-                raise GpvoError("is another file, not an earlier export", where=path, cure="choose another -o")
+    refuse_foreign(path, _WRITTEN[to], "export")
     if prefix != PREFIX and to != "c":
         raise GpvoError(f"{to} has no symbols to prefix with '{prefix}'", cure="give it only with c")
     predictor = Predictor.load(model)

@@ -4,7 +4,7 @@ Frame of every motion, covariance, error and feature: the rectified left optical
 (x right, y down, z forward). Tangent order: translation xyz [m], rotation xyz [rad], right perturbation.
 """
 
-from gpvo.types.predictions import MotionError, Prediction, StoredPredictions
+from gpvo.types.predictions import ByStamp, MotionError, Prediction, StoredPredictions
 from gpvo.types.records import (
     COUNT_FIELDS,
     FLOAT_FIELDS,
@@ -44,6 +44,7 @@ __all__ = [
     "STANDARD_GRAVITY_MPS2",
     "VEHICLES",
     "Array",
+    "ByStamp",
     "ImuLog",
     "ImuMoments",
     "ImuNoise",

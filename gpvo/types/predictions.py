@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
-from dataclasses import dataclass
+from collections.abc import Iterable, Iterator, Mapping
+from dataclasses import dataclass, fields
 from functools import cached_property
+from itertools import islice
 from typing import Any, TypeVar
 
 import numpy as np
@@ -14,6 +15,8 @@ from numpy.typing import NDArray
 from gpvo.types.records import Columns, Status, VoRecord
 from gpvo.types.sensors import Array
 
+_AT_ONCE = 1000  # predictions as objects
+_MOST_PERSISTENT = 12
 _Error = TypeVar("_Error", bound="MotionError")
 
 
@@ -117,14 +120,71 @@ class Prediction(MotionError):
 
 @dataclass(frozen=True, eq=False)
 class StoredPredictions(Columns[Prediction]):
-    """N predictions as columns, a third of what they take as objects.
+    """N predictions as columns, a fifth of what they take as objects.
 
-    ``columns``: the fields of a prediction by name, (N, ...).
+    ``columns``: the fields of a prediction by name, (N, ...); of what persists, 12 columns of roots.
     """
 
     columns: Mapping[str, NDArray[Any]]
+
+    @classmethod
+    def of(cls, predictions: Iterable[Prediction]) -> StoredPredictions:
+        """Predictions as they come: a thousand at a time are objects."""
+        if isinstance(predictions, StoredPredictions):
+            return predictions
+        coming, parts = iter(predictions), list[StoredPredictions]()
+        while (some := list(islice(coming, _AT_ONCE))) or not parts:
+            columns = {f.name: [getattr(p, f.name) for p in some] for f in fields(Prediction)}
+            columns["persistent_root"] = [_wide(root, 0.0) for root in columns["persistent_root"]]
+            columns["persistent_tau_s"] = [_wide(tau_s, 1.0) for tau_s in columns["persistent_tau_s"]]
+            parts.append(cls({name: _column(name, values) for name, values in columns.items()}))
+        return cls.join(parts)
 
     def made(self, k: int) -> Prediction:
         """Prediction k."""
         of_one = {name: column.item(k) if column.ndim == 1 else column[k] for name, column in self.columns.items()}
         return Prediction(**of_one)
+
+
+_SHAPES = {"persistent_root": (6, _MOST_PERSISTENT), "persistent_tau_s": (_MOST_PERSISTENT,)}
+_SHAPES |= dict.fromkeys(("mean", "epistemic"), (6,)) | dict.fromkeys(("jitter", "white"), (6, 6))
+
+
+def _column(name: str, values: list[Any]) -> NDArray[Any]:
+    """One field of N predictions, (N, ...) also where N is zero."""
+    kind = {"t_ns": np.int64, "status": object}.get(name, np.float64)
+    return np.array(values, dtype=kind).reshape(len(values), *_SHAPES.get(name, ()))
+
+
+def _wide(persistent: Array, fill: float) -> Array:
+    """Roots (6, P) or time constants (P,) of what persists, filled up to 12 of them."""
+    out = np.full((*persistent.shape[:-1], _MOST_PERSISTENT), fill)
+    out[..., : persistent.shape[-1]] = persistent
+    return out
+
+
+class ByStamp(Mapping[int, Prediction]):
+    """The ``stored`` predictions of ``rows``, by the stamp where their motion ends, in order; each is made when it is
+    asked for."""
+
+    def __init__(self, stored: StoredPredictions, rows: Mapping[int, int]) -> None:
+        self.stored, self._rows = stored, rows
+
+    @classmethod
+    def of(cls, predictions: Iterable[Prediction]) -> ByStamp:
+        """All of them, kept as columns."""
+        stored = StoredPredictions.of(predictions)
+        return cls(stored, dict(zip(stored.columns["t_ns"].tolist(), range(len(stored)))))
+
+    def only(self, t_ns: Iterable[int]) -> ByStamp:
+        """Those of some stamps."""
+        return ByStamp(self.stored, {t: self._rows[t] for t in t_ns})
+
+    def __getitem__(self, t_ns: int) -> Prediction:
+        return self.stored.made(self._rows[t_ns])
+
+    def __iter__(self) -> Iterator[int]:
+        return iter(self._rows)
+
+    def __len__(self) -> int:
+        return len(self._rows)

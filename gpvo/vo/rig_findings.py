@@ -99,6 +99,9 @@ def _camera_px(camera: StereoCamera) -> list[float]:
 
 def read_state(path: Path, camera: StereoCamera) -> RigState:
     """The state of a file, or of a run folder. Raises SourceError where it is damaged, or of another camera."""
+    if path.is_dir() and not (path / STATE_FILE).is_file():
+        cure = "gpvo run estimates one, except with --no-self-calibration or --preset thesis"
+        raise SourceError("holds no calibration state", where=path, cure=cure)
     path = path / STATE_FILE if path.is_dir() else path
     return _state_of(read_json(path), path, camera)
 

@@ -322,3 +322,64 @@ def test_a_run_that_states_nothing_of_motions_is_told_with_the_files_for_score(c
     assert code == 0
     assert "slam states no covariance of single motions" in err
     assert [p.name for p in (tmp_path / "stated").iterdir()] == ["truth"]
+
+
+def test_a_report_replaces_an_earlier_one_and_nothing_else(capsys, run_folder, tmp_path):
+    page = tmp_path / "report.html"
+    page.write_text("<!doctype html><title>gpvo, as I see it</title>")
+    before = page.read_bytes()
+    code, out, err = _main(capsys, "report", run_folder, "-o", page)
+    assert (code, out, page.read_bytes()) == (2, "", before)
+    assert "report.html: is another file, not an earlier report" in err.splitlines()[0]
+    page.unlink()
+    assert [_main(capsys, "report", run_folder, "-o", page)[0] for _ in range(2)] == [0, 0]
+
+
+def test_the_offset_that_evaluate_advises_is_an_option_of_train(capsys, tmp_path):
+    """Of a truth on another clock, with it, a model is that of the truth on the log's, to the bit."""
+    late_s, models = 0.25, {}
+    for k, by_s in enumerate((0.0, late_s)):
+        log, truth = synthetic_run(4, n=300)
+        truth = replace(truth, t_ns=truth.t_ns + round(by_s * 1e9))
+        write_run(tmp_path / str(k) / "run", log, truth=truth)
+    advice = _main(capsys, "evaluate", tmp_path / "1" / "run")[1]
+    assert "with --time-offset auto" in advice
+    for name, run, offset in (("own", "0", "0"), ("late", "1", str(late_s)), ("auto", "1", "auto")):
+        given = (tmp_path / run / "run", "--time-offset", offset, "-o", tmp_path / f"{name}.gpvo")
+        code, _, err = _main(capsys, "train", *given)
+        assert (code, "contradict" in err) == (0, False)
+        models[name], header = modelfile.load(tmp_path / f"{name}.gpvo")
+        assert header["config"].get("time_offset_s", 0.0) == {"own": 0.0, "late": late_s, "auto": None}[name]
+    assert models["own"].keys() == models["late"].keys()
+    for name, array in models["own"].items():
+        np.testing.assert_array_equal(array, models["late"][name])
+    np.testing.assert_allclose(
+        models["auto"]["method.constant"], models["own"]["method.constant"], rtol=0.05, atol=1e-7
+    )
+
+
+def test_an_offset_that_nothing_tells_names_the_run(capsys, tmp_path):
+    log, truth = synthetic_run(4, n=40)
+    write_run(tmp_path / "short", log, truth=truth)
+    for command in (["evaluate"], ["train", "-o", tmp_path / "m.gpvo"]):
+        code, out, err = _main(capsys, *command, tmp_path / "short", "--time-offset", "auto")
+        assert (code, out, len(err.splitlines())) == (2, "", 1)
+        assert "short: the log lasts 2.00 s" in err
+
+
+@pytest.mark.parametrize("lost", [False, True], ids=["short", "lost throughout"])
+def test_what_no_run_so_short_or_lost_can_tell_is_said_of_it(capsys, tmp_path, lost):
+    log, truth = make_run(200 if lost else 12, lost=set(range(1, 201)) if lost else set())
+    write_run(tmp_path / "run", log, truth=truth)
+    code, out, err = _main(capsys, "train", tmp_path / "run", "-o", tmp_path / "m.gpvo")
+    assert (code, out, len(err.splitlines())) == (2, "", 1)
+    of = "0 of 200" if lost else "12 of 12"
+    assert f"run: only {of} motions were measured, 30 are needed (give a longer sequence" in err
+    save_model(small_model(), tmp_path / "m.gpvo")
+    code, out, _ = _main(capsys, "predict", tmp_path / "m.gpvo", tmp_path / "run", "-o", tmp_path / "p.parquet")
+    assert (code, "nan" in out, "no motion was measured" in out) == (0, False, lost)
+    code, out, err = _main(capsys, "calibration", tmp_path / "run")
+    assert (code, out, len(err.splitlines())) == (2, "", 1)
+    assert "run: holds no calibration state (gpvo run estimates one" in err
+    code, out, err = _main(capsys, "score", tmp_path / "none")
+    assert (code, out, err) == (2, "", f"gpvo: {tmp_path / 'none'}: no such file or folder\n")

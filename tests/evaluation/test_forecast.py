@@ -134,6 +134,31 @@ def test_document_table_picture_and_frames(capsys, tmp_path, model_file):
     assert not list(tmp_path.glob("*.part"))
 
 
+@pytest.mark.parametrize(("option", "name"), [("--plot", "p.png"), ("--plot", "p.pdf"), ("--plot", "p.svg"),
+                                              ("-o", "p.csv"), ("-o", "p.parquet")])  # fmt: skip
+def test_a_forecast_replaces_an_earlier_one_and_nothing_else(capsys, tmp_path, model_file, option, name):
+    plan, foreign = truth_plan(7, n=60), b"\x89PNG of somebody, or t_s,distance_m by hand"
+    write_tum(tmp_path / "cam.tum", np.round(plan.t_s * 1e9).astype(np.int64), plan.T_world_cam)
+    given = (model_file, "--path", tmp_path / "cam.tum", option, tmp_path / name)
+    (tmp_path / name).write_bytes(foreign)
+    code, out, err = _main(capsys, *given)
+    assert (code, out, len(err.splitlines())) == (2, "", 1)
+    assert f"{name}: is another file, not an earlier" in err
+    assert (tmp_path / name).read_bytes() == foreign
+    (tmp_path / name).unlink()
+    assert [_main(capsys, *given)[0] for _ in range(2)] == [0, 0]
+    assert (tmp_path / name).read_bytes() != foreign
+
+
+def test_a_plot_never_replaces_the_plan(capsys, tmp_path, model_file):
+    plan = truth_plan(7, n=60)
+    write_tum(tmp_path / "cam.tum", np.round(plan.t_s * 1e9).astype(np.int64), plan.T_world_cam)
+    before = (tmp_path / "cam.tum").read_bytes()
+    code, _, err = _main(capsys, model_file, "--path", tmp_path / "cam.tum", "--plot", tmp_path / "cam.tum")
+    assert (code, (tmp_path / "cam.tum").read_bytes()) == (2, before)
+    assert "does not have the suffix of an image" in err
+
+
 def test_what_cannot_be_forecast_is_one_line(capsys, tmp_path, model_file):
     write_tum(tmp_path / "short.tum", np.array([0, 60_000_000]), np.stack([np.eye(4)] * 2))
     write_tum(tmp_path / "plan.tum", np.array([0, 10**9]), np.stack([np.eye(4)] * 2))

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import tracemalloc
 from dataclasses import replace
 
 import numpy as np
@@ -119,3 +120,19 @@ def test_a_run_without_truth_has_not_said_that_it_held() -> None:
     np.testing.assert_array_equal(of_all.column("constant", "diverged"), [1.0, 0.0, np.nan, np.nan])
     assert of_all.diverged("constant") == 1
     assert of_all.diverged("learned") is None
+
+
+def test_a_record_costs_two_kilobytes_for_each_policy() -> None:
+    """Of a day's flight the filter's own states would fill the memory: each is twenty times as large."""
+    C = 1e-4 * np.eye(6)
+    flights = [replace(with_geometric(synthetic_flight(3, duration_s=s), C), imu=None, T_imu_cam=None) for s in (5, 25)]
+    policies = {str(k): ConstantPolicy(np.full(6, 1e-5), 0.05, name=str(k)) for k in range(6)}
+    fuse_side_by_side(flights[0], policies)  # caches are filled
+    peak = []
+    for flight in flights:
+        tracemalloc.start()
+        fuse_side_by_side(flight, policies)
+        peak.append(tracemalloc.get_traced_memory()[1])
+        tracemalloc.stop()
+    more = len(flights[1].records) - len(flights[0].records)
+    assert (peak[1] - peak[0]) / more < 2000 * len(policies)

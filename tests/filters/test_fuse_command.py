@@ -151,6 +151,17 @@ def test_bad_options_are_one_line(runs: list[Path], arguments: tuple[str, str], 
         _run("fuse", runs[0], *arguments)
 
 
+def test_a_plot_replaces_an_earlier_one_and_nothing_else(runs: list[Path], tmp_path: Path) -> None:
+    path, asked = tmp_path / "fuse.png", ("--plot", tmp_path / "fuse.png", "--policies", "pointing_matching")
+    path.write_bytes(b"\x89PNG of somebody")
+    with pytest.raises(GpvoError, match="fuse.png: is another file, not an earlier plot"):
+        _run("fuse", runs[0], *asked)
+    assert path.read_bytes() == b"\x89PNG of somebody"
+    path.unlink()
+    _run("fuse", runs[0], *asked)
+    _run("fuse", runs[0], *asked)
+
+
 def _write_at_rest(path: Path) -> Path:
     """A run without truth whose camera and IMU stand still."""
     rng, C = np.random.default_rng(0), np.diag([1e-6] * 6)

@@ -190,6 +190,42 @@ def test_an_edited_calibration_that_lies_elsewhere_begins_anew(tmp_path: Path, m
     assert anew == 7
 
 
+def test_images_behind_a_link_that_changed_begin_anew(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """A camera's folder may be a link to another disk, or lead back to where it stands."""
+    monkeypatch.setattr(runner, "RunWriter", partial(RunWriter, chunk=3))
+    rng, went = np.random.default_rng(0), []
+    step = StereoOdometry.step
+    monkeypatch.setattr(StereoOdometry, "step", lambda *given: (went.append(True), step(*given))[1])
+    block = "  camera_model: pinhole\n  intrinsics: [60.0, 60.0, 31.5, 23.5]\n  distortion_model: radtan\n"
+    block += "  distortion_coeffs: [0.0, 0.0, 0.0, 0.0]\n  resolution: [64, 48]\n"
+    (tmp_path / "source").mkdir()
+    (tmp_path / "source" / "camchain.yaml").write_text(f"cam0:\n{block}cam1:\n{block}{POSE}")
+    (tmp_path / "source" / "again").symlink_to(tmp_path / "source")
+    for side in ("left", "right"):
+        (tmp_path / "disk" / side).mkdir(parents=True)
+        (tmp_path / "source" / side).symlink_to(tmp_path / "disk" / side)
+
+    def broken(seed: int | None) -> int:
+        """How many frames odometry goes through until the run breaks off at the 7th; with a seed, of new images."""
+        if seed is not None:
+            picture = rng.integers(0, 255, (48, 64 + seed), dtype=np.uint8)[:, seed:]
+            for side in ("left", "right"):
+                for k in range(9):
+                    cv2.imwrite(str(tmp_path / "disk" / side / f"{10**18 + k * 10**8}.png"), picture)
+        left = iter(range(6))
+
+        def stop(*_: object) -> None:
+            if next(left, None) is None:
+                raise KeyboardInterrupt
+
+        went.clear()
+        with pytest.raises(KeyboardInterrupt):
+            runner.run(open_source(tmp_path / "source"), tmp_path / "run", on_frame=stop, options={})
+        return len(went)
+
+    assert [broken(0), broken(None), broken(1), broken(None)] == [7, 1, 7, 1]
+
+
 def test_the_command_resumes_where_it_was_stopped(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(runner, "RunWriter", partial(RunWriter, chunk=5))
     monkeypatch.setattr("sys.argv", ["gpvo", "run", str(tracks(tmp_path)), "-o", str(tmp_path / "run")])

@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 import copy
+import hashlib
 import pickle
 import subprocess
 import sys
+import tracemalloc
 from dataclasses import replace
 from pathlib import Path
 
@@ -15,6 +17,7 @@ from gpvo.dataset.build import build
 from gpvo.errors import GpvoError, ModelError
 from gpvo.geometry import se3
 from gpvo.geometry.covariance import is_positive_definite
+from gpvo.online import modelfile
 from gpvo.online.division import divide, ln_faster
 from gpvo.online.guard import AdaptiveScale
 from gpvo.online.observer import Observer, joined
@@ -430,3 +433,48 @@ def test_a_status_may_be_given_as_text(flight):
     assert record.status is Status.LOST
     with pytest.raises(ValueError, match="'fine' is not a valid Status"):
         replace(record, status="fine")
+
+
+def test_the_digest_is_that_of_the_arrays_that_were_read(tmp_path, monkeypatch):
+    """Also where the file is replaced meanwhile, as by a training that ends."""
+    path, trained = tmp_path / "m.gpvo", small_model()
+    modelfile.save(path, trained.arrays, trained.header)
+    ours = hashlib.sha256(path.read_bytes()).hexdigest()
+    check = modelfile._check_document
+
+    def replaced(*given):
+        modelfile.save(path, trained.arrays, {**trained.header, "note": "another"})
+        check(*given)
+
+    monkeypatch.setattr(modelfile, "_check_document", replaced)
+    assert Predictor.load(path).digest == ours
+    assert hashlib.sha256(path.read_bytes()).hexdigest() != ours
+
+
+def test_predictions_of_a_run_take_two_kilobytes_each(predictor):
+    """Also once their covariances were asked for, as filters and scores do of all."""
+    took = []
+    for n in (200, 1200):
+        log = make_run(50, n=n)[0]
+        predictor.replay(log)
+        tracemalloc.start()
+        said = predictor.replay(log)
+        assert all(p.covariance[0, 0] > 0 for p in said.values())
+        took.append(tracemalloc.get_traced_memory()[0])
+        tracemalloc.stop()
+        assert len(said) == len(log)
+    assert (took[1] - took[0]) / 1000 < 2000
+
+
+def test_predictions_kept_as_columns_are_those_that_were_made(predictor, flight):
+    log = flight[0]
+    kept = predictor.replay(log)
+    predictor.reset(log.camera)
+    made = [p for p in map(predictor.step, log) if p is not None]
+    assert list(kept) == [p.t_ns for p in made]
+    for p in made:
+        for name, value in vars(kept[p.t_ns]).items():
+            assert np.array_equal(value, vars(p)[name]), name
+        assert np.array_equal(kept[p.t_ns].covariance, p.covariance)
+    assert list(kept.only([made[3].t_ns])) == [made[3].t_ns]
+    assert 0 not in kept.only([])

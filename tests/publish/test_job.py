@@ -193,7 +193,7 @@ def test_an_export_replaces_an_earlier_one_and_nothing_else(tmp_path: Path, to: 
     if not (tmp_path / name).exists():
         (tmp_path / name).write_text("int main(void) { return 0; }")
     before = (tmp_path / name).read_bytes()
-    with pytest.raises(GpvoError, match=rf"{name}: is another file, not an earlier export \(choose another -o"):
+    with pytest.raises(GpvoError, match=rf"{name}: is another file, not an earlier export \(choose another name"):
         export_model(model, tmp_path / name, to)
     assert (tmp_path / name).read_bytes() == before
     out = tmp_path / {"c": "new.h", "onnx": "new.onnx"}[to]
