@@ -13,6 +13,7 @@ from pathlib import Path
 from typing import Any, Literal
 
 from gpvo.errors import GpvoError
+from gpvo.files import read_toml
 
 Way = Literal["recipe", "corrected", "full"]
 WAYS: dict[Way, str] = {
@@ -100,77 +101,28 @@ class Experiment:
     warning: bool = False
 
 
-_SAME_PLACE = {"world_seed": 4343, "points.world_seed": 4343}
-_FLOWN = {"vehicle": "path", "imu": "t265"}
+_DECLARED = read_toml(Path(__file__).with_name("experiments.toml"))
 
-FLIGHTS: dict[str, FlightSet] = {
-    s.name: s
-    for s in (
-        FlightSet("tunnel", ("tunnel-clean",)),
-        FlightSet("tunnel-noisy", ("tunnel-noise",)),
-        FlightSet("tunnel-training", ("tunnel-clean", "tunnel-noise"), first_seed=1000, thesis_preset=False),
-        FlightSet("same-path", ("tunnel-clean",), _SAME_PLACE),
-        FlightSet("same-path-training", ("tunnel-clean",), _SAME_PLACE, first_seed=2000),
-        FlightSet("moon", ("lunar-straight",), longer=2.0),
-        FlightSet("moon-training", ("lunar-straight",), first_seed=3000, thesis_preset=False),
-        FlightSet("t265", ("room-t265",), _FLOWN, "test"),
-        FlightSet("t265-training", ("room-t265",), _FLOWN, "training", first_seed=4000),
-        FlightSet("t265-perfect", ("room-t265",), {**_FLOWN, "calibration": {}}, "training", first_seed=5000),
-        FlightSet(
-            "moon-clean", ("lunar-straight",), {"noise_sigma": 0.0, "points.noise_px": 0.0}, longer=2.0,
-            points_only=True,
-        ),
-    )
-}  # fmt: skip
 
-_TUNNEL = "simulated mine tunnel for the thesis' tunnel"
-_ROVER = "simulated rover on the moon for the thesis' rover"
-_UAV = "fisheye sequences drawn along recorded paths, calibration off by the datasheet's tolerance, for the real UAV"
+def _values(table: Mapping[str, Any]) -> dict[str, Any]:
+    return {key: tuple(value) if isinstance(value, list) else value for key, value in table.items()}
 
-EXPERIMENTS: tuple[Experiment, ...] = (
-    Experiment(
-        "4.1-clean", "4.1", "tunnel, triangulation, clean", "tunnel", "tunnel-training", "triangulation",
-        Published(2.03, 2.47, 3.32), "4.1", stands_in=_TUNNEL,
-    ),
-    Experiment(
-        "4.1-noisy", "4.1", "tunnel, triangulation, image noise 0.025", "tunnel-noisy", "tunnel-training",
-        "triangulation", Published(2.79, 3.32, 7.01), "4.2", stands_in=_TUNNEL,
-    ),
-    Experiment(
-        "4.2-clean", "4.2", "tunnel, sigma_p 0.1, sigma_m 0.5, clean", "tunnel", "tunnel-training",
-        "pointing_matching", Published(1.92, 1.49, 3.21), "4.3", (0.1, 0.5), stands_in=_TUNNEL,
-    ),
-    Experiment(
-        "4.2-noisy", "4.2", "tunnel, sigma_p 0.1, sigma_m 1.0, image noise 0.025", "tunnel-noisy", "tunnel-training",
-        "pointing_matching", Published(2.79, 2.98, 4.90), "4.4", (0.1, 1.0), stands_in=_TUNNEL,
-    ),
-    Experiment(
-        "4.3", "4.3", "tunnel, GP on velocity and features, same path as training", "same-path", "same-path-training",
-        "gp", Published(1.81, 1.03, 2.11, 1.94), "4.5", stands_in=_TUNNEL,
-    ),
-    Experiment(
-        "4.4", "4.4", "lunar rover, long straight, noisy pair every few frames, sigma_p 0.1, sigma_m 0.5", "moon",
-        "moon-training", "pointing_matching", Published(3.01, 1.79, 4.36), "4.6", (0.1, 0.5), stands_in=_ROVER,
-    ),
-    Experiment(
-        "4.5", "4.5", "real UAV (here drawn), T265 fisheye, sigma_p 0.5, sigma_m 0.5", "t265", "t265-training",
-        "pointing_matching", Published(1.57, 1.41, 1.92), "4.7", (0.5, 0.5), stands_in=_UAV,
-    ),
-    Experiment(
-        "4.6", "4.6", "real UAV (here drawn), GP trained on simulation", "t265", "t265-training", "gp",
-        Published(1.57, 1.41, 2.99, 2.49), "4.8", stands_in=_UAV,
-    ),
-    Experiment(
-        "4.6-perfect", "4.6", "warning: trained on a perfect calibration, used on a real one", "t265", "t265-perfect",
-        "gp", None, stands_in=_UAV, warning=True,
-    ),
-)  # fmt: skip
+
+def _experiment(table: Mapping[str, Any]) -> Experiment:
+    values = _values(table)
+    figures = values.pop("published", None)
+    return Experiment(**values, published=figures and Published(**figures))
+
+
+FLIGHTS: dict[str, FlightSet] = {name: FlightSet(name, **_values(s)) for name, s in _DECLARED["flights"].items()}
+EXPERIMENTS: tuple[Experiment, ...] = tuple(map(_experiment, _DECLARED["experiment"]))
 
 SENSITIVITY_PX: tuple[tuple[float, float], ...] = ((0.1, 0.1), (0.1, 0.5), (0.1, 1.0))
 SENSITIVITY: tuple[Experiment, ...] = tuple(
     Experiment(
         f"sensitivity-{name}-{p}-{m}", "sensitivity", f"tunnel, {name}, sigma_p {p}, sigma_m {m}", flights,
-        "tunnel-training", "pointing_matching", None, "4.9" if (p, m) == (0.1, 0.1) else "", (p, m), _TUNNEL,
+        "tunnel-training", "pointing_matching", None, "4.9" if (p, m) == (0.1, 0.1) else "", (p, m),
+        EXPERIMENTS[0].stands_in,
     )
     for name, flights in (("clean", "tunnel"), ("image noise 0.025", "tunnel-noisy"))
     for p, m in SENSITIVITY_PX
