@@ -208,7 +208,8 @@ def _cell(value: float, digits: int, width: int) -> str:
         return f"{'-':>{width}}"
     while digits and len(f"{value:.{digits}f}") >= width:
         digits -= 1
-    return f"{value:>{width}.{digits}f}"
+    text = f"{value:.{digits}f}"
+    return f"{text if len(text) < width else f'{value:.0e}':>{width}}"
 
 
 @dataclass(frozen=True)

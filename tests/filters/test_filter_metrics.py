@@ -122,6 +122,14 @@ def test_a_run_without_truth_has_not_said_that_it_held() -> None:
     assert of_all.diverged("learned") is None
 
 
+def test_columns_hold_numbers_of_any_size() -> None:
+    told = fuse_flight(synthetic_flight(0, duration_s=2), ConstantPolicy(np.full(6, 1e-5), 0.05))[0].scores
+    gone = replace(told, ate_rmse_m=8.5e9, final_error_m=7.4e21, nees_position=6e8, nis_dof=123456.0)
+    row = table(Study(("a",), {"constant": (gone,)})).splitlines()[1]
+    assert len(row) <= 80
+    assert [float(v) for v in row.split()[1:3]] == [pytest.approx(8.5e9, rel=0.1), pytest.approx(7.4e21, rel=0.1)]
+
+
 def test_a_record_costs_two_kilobytes_for_each_policy() -> None:
     """Of a day's flight the filter's own states would fill the memory: each is twenty times as large."""
     C = 1e-4 * np.eye(6)
