@@ -54,7 +54,7 @@ from gpvo.types import STANDARD_GRAVITY_MPS2, Array, ImuNoise, MotionError
 _POSE = np.array([0, 1, 2, 6, 7, 8])  # position and attitude inside the core
 _STATE = CLONE.stop  # core and clone; what follows is VO's
 _MOST_SPEED_VAR, _MOST_ANGLE_VAR = 100.0, 0.1  # (10 m/s)^2, (18 deg)^2: no state is doubted beyond
-_FAR_M, _ROUNDINGS = 1e3, 64.0
+_FAR_M, _ROUNDINGS = 3e5, 64.0
 _UNSEEN_TURN_RAD, _UNSEEN_TILT_RAD = 1.0, 0.2  # about and from the vertical, while nothing is heard
 
 
@@ -261,7 +261,7 @@ class ErrorStateFilter:
 
     def _rounding(self, H: Array) -> Array:
         """(B, m, m) by what a motion is read off less well where the place, which it does not depend on, is so unsure
-        that its variance leaves the motion's own too few digits; zero up to a sigma of a kilometre."""
+        that its variance leaves the motion's own too few digits; zero up to a sigma of 300 km."""
         largest = variances(self.P)[:, P].max(axis=1)
         lost = np.where(largest > _FAR_M**2, _ROUNDINGS * np.finfo(float).eps * largest, 0.0)
         return np.asarray((lost[:, None] * np.square(H[:, :, P]).sum(axis=2))[:, :, None] * np.eye(H.shape[1]))
