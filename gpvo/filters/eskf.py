@@ -231,9 +231,12 @@ class ErrorStateFilter:
         """
         r = residual - (H @ self.dx[:, :, None])[:, :, 0]
         PHt = self.P @ transpose(H)
-        R = R + self._rounding(H)
-        S = H @ PHt + R
-        L = np.asarray(np.linalg.cholesky(S), dtype=np.float64)
+        R = R + self._rounding(H, _FAR_M)
+        try:
+            L = np.asarray(np.linalg.cholesky(S := H @ PHt + R), dtype=np.float64)
+        except np.linalg.LinAlgError:
+            R = R + self._rounding(H, 0.0)
+            L = np.asarray(np.linalg.cholesky(S := H @ PHt + R), dtype=np.float64)
         whitened: Array = np.linalg.solve(L, np.concatenate([transpose(PHt), r[:, :, None]], axis=2))
         z = whitened[:, :, -1]
         nis = (z * z).sum(1)
@@ -259,11 +262,11 @@ class ErrorStateFilter:
             self.dx += (K @ r[:, :, None])[:, :, 0]
         return Innovation(r, S, nis, passed, used, own_fault)
 
-    def _rounding(self, H: Array) -> Array:
+    def _rounding(self, H: Array, from_m: float) -> Array:
         """(B, m, m) by what a motion is read off less well where the place, which it does not depend on, is so unsure
-        that its variance leaves the motion's own too few digits; zero up to a sigma of 300 km."""
+        that its variance leaves the motion's own too few digits; zero up to a sigma of ``from_m``."""
         largest = variances(self.P)[:, P].max(axis=1)
-        lost = np.where(largest > _FAR_M**2, _ROUNDINGS * np.finfo(float).eps * largest, 0.0)
+        lost = np.where(largest > from_m**2, _ROUNDINGS * np.finfo(float).eps * largest, 0.0)
         return np.asarray((lost[:, None] * np.square(H[:, :, P]).sum(axis=2))[:, :, None] * np.eye(H.shape[1]))
 
     def _own_part(self, H: Array, S: Array, r: Array) -> Array:

@@ -12,10 +12,11 @@ from gpvo.errors import GpvoError
 from gpvo.filters.plausible import cleaned, usable
 from gpvo.filters.propagation import BA, BG, DEFAULT_IMU_NOISE, TH, Nominal, V
 from gpvo.geometry import se3
-from gpvo.stats.series import integral, interpolated
+from gpvo.stats.series import integral, interpolated, median
 from gpvo.types import STANDARD_GRAVITY_MPS2, Array, ImuLog
 
 _SLOPE_POSES = 5  # true poses that the velocity at the start is taken from
+_GAP_S, _GAP_STEPS = 1.0, 10.0  # stamps are missing where they are further apart than both
 _STRETCH_S, _STRETCHES = 1.0, 15  # that the vertical is measured over: at least so long, at most so many
 _ROUNDS, _HUBER = 10, 2.0  # of reweighting; a stretch further off, in sigmas of its three axes together, counts less
 _MEDIAN_OF_NORM = 1.54  # of three standard normal numbers
@@ -180,22 +181,26 @@ def vertical_in_world(
     is gravity's reaction plus the bias, turned as the vehicle was: what turns with it is bias, the rest is up. Least
     squares over many hats with Huber's weights, which readings of a failing IMU do not move far.
     """
-    t_s = (t_ns - t_ns[0]) * 1e-9
-    count = int(np.clip(t_s[-1] / _STRETCH_S, 2, _STRETCHES))
-    ends = np.unique(np.searchsorted(t_s, np.linspace(0.0, t_s[-1], count + 1)))
-    rising, falling = _under_slopes(cleaned(imu), t_ns, T_world_imu, ends)
+    imu, t_s = cleaned(imu), (t_ns - t_ns[0]) * 1e-9
+    unseen = _gaps(t_s, t_s) | _gaps((imu.t_ns - t_ns[0]) * 1e-9, t_s)
+    seen_s = np.append(0.0, np.cumsum(np.where(unseen, 0.0, np.diff(t_s))))
+    count = int(np.clip(seen_s[-1] / _STRETCH_S, 2, _STRETCHES))
+    ends = np.unique(np.searchsorted(seen_s, np.linspace(0.0, seen_s[-1], count + 1)))
+    rising, falling = _under_slopes(imu, t_ns, T_world_imu, ends)
     if len(ends) < 3:  # two poses tell no acceleration: it is taken to be none
         means = (rising + falling) / t_s[-1]
     else:
         means = rising[:-1] + falling[1:]
         means[:, :, 0] -= np.diff(np.diff(T_world_imu[ends, :3, 3], axis=0) / np.diff(t_s[ends])[:, None], axis=0)
         means /= 0.5 * (t_s[ends][2:] - t_s[ends][:-2])[:, None, None]
+        whole = np.array([not unseen[first:last].any() for first, last in zip(ends[:-2], ends[2:], strict=True)])
+        means = means[whole] if whole.any() else means
     seen, turned = means[:, :, 0], means[:, :, 1:]
     X = np.concatenate([np.broadcast_to(np.eye(3), turned.shape), turned], axis=2)
     prior = np.diag(np.repeat([0.0, acc_bias_mps2**-2], 3))
     x = np.append(np.median(seen, axis=0), np.zeros(3))
     density = (imu.noise or DEFAULT_IMU_NOISE).acc_density_mps2_sqrthz
-    least = density * float(np.sqrt(_OVERLAP**-1 / t_s[-1] * count))
+    least = density * float(np.sqrt(_OVERLAP**-1 / seen_s[-1] * count))
     free = seen.size - 3.0
     for _ in range(_ROUNDS):
         off = np.linalg.norm(seen - X @ x, axis=1)
@@ -208,6 +213,13 @@ def vertical_in_world(
     up, g = x[:3] / np.linalg.norm(x[:3]), float(np.linalg.norm(x[:3]))
     turn = se3.skew(up) / g  # an error of the vector turns it by up x error / g
     return up, turn @ C[:3, :3] @ turn.T
+
+
+def _gaps(s: Array, t_s: Array) -> NDArray[np.bool_]:
+    """(N - 1,) which intervals between these stamps ``t_s`` (N,) [s] lie, in part, where stamps ``s`` are missing."""
+    step_s = np.diff(s)
+    last = np.flatnonzero(step_s > max(_GAP_S, _GAP_STEPS * median(step_s)))  # before each gap
+    return np.searchsorted(s[last], t_s[1:]) > np.searchsorted(s[last + 1], t_s[:-1], side="right")
 
 
 def _under_slopes(

@@ -143,6 +143,22 @@ def test_sparse_poses_tell_the_vertical_as_well_as_dense_ones() -> None:
     assert _verticals(2.0, 15.0)[1] < 1.5 * _verticals(20.0, 15.0)[1]
 
 
+def test_a_recording_that_paused_tells_the_vertical_as_one_that_did_not() -> None:
+    """All stamps jump by minutes, twice, while nothing moves."""
+    flight = synthetic_flight(5, duration_s=20)
+    assert flight.imu is not None
+    t_ns = np.array([r.t_ns for r in flight.records])
+
+    def paused(stamps: np.ndarray) -> np.ndarray:
+        return stamps + sum(np.where(stamps > t_ns[k], pause, 0) for k, pause in ((90, 180 * 10**9), (230, 4 * 10**11)))
+
+    (up, C), (later, _) = (
+        vertical_in_world(replace(flight.imu, t_ns=of(flight.imu.t_ns)), of(t_ns), flight.T_world_imu, 0.05)
+        for of in (np.asarray, paused)
+    )
+    assert np.linalg.norm(np.cross(up, later)) < np.sqrt(np.trace(C))
+
+
 @pytest.mark.parametrize("tilt_deg", [0.8, 3.0, 45.0])
 def test_a_truth_that_is_not_level_is_judged_as_one_that_is(tilt_deg: float) -> None:
     tilted = se3.from_rt(se3.so3_exp(np.radians([tilt_deg, 0, 0])), np.zeros(3))
