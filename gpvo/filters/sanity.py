@@ -234,8 +234,11 @@ def _gyroscope(flight: Flight, imu: ImuLog) -> Iterator[Finding]:
     correlation = vo.T @ gyro / (np.linalg.norm(vo, axis=0)[:, None] * np.linalg.norm(gyro, axis=0) + 1e-300)
     agreement = [float((M * correlation).sum() / 3.0) for M in _RELABELLINGS]
     best = int(np.argmax(agreement))
-    renamed = best != 0 and agreement[best] - agreement[0] > 0.2
-    together = float((vo * (gyro @ _RELABELLINGS[best].T)).sum() / np.sqrt(energy_vo * energy_gyro))
+    # Axes that a vehicle hardly turns about correlate by chance, with either sign: one that says so must do it clearly.
+    M = _RELABELLINGS[best]
+    told = float((M * correlation).sum(axis=1)[(np.eye(3) != M).any(axis=1)].max(initial=0.0))
+    renamed = best != 0 and agreement[best] - agreement[0] > 0.2 and told > 0.5
+    together = float((vo * (gyro @ M.T)).sum() / np.sqrt(energy_vo * energy_gyro))
     if np.abs(correlation).max() < 0.5 or (renamed and together < _TOGETHER):
         text = f"gyroscope and VO do not turn together (correlation {agreement[0]:.2f} as given)"
         yield Finding("gyro_axes", text, "check clock offset and T_imu_cam; is it the IMU of this flight?", fatal=False)

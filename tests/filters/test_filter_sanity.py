@@ -16,6 +16,9 @@ from gpvo.filters.run import Flight, fuse_flight
 from gpvo.filters.sanity import check_flight, require_sane
 from gpvo.geometry import se3
 from gpvo.io.run import read_run
+from gpvo.io.source import open_source
+from gpvo.runner import run
+from gpvo.sim.points import simulate_points
 from gpvo.types import ImuLog
 from synthetic_flights import ErrorLaw, synthetic_flight, with_geometric
 
@@ -110,6 +113,14 @@ def test_the_imu_of_another_flight_has_no_swapped_axes(flight: Flight, seed: int
     """Of 48 names for its axes, one agrees by chance."""
     found = check_flight(replace(flight, imu=synthetic_flight(seed, duration_s=20).imu))
     assert not any("axes renamed" in f.text for f in found)
+
+
+@pytest.mark.parametrize("seed", [3, 4, 5])
+def test_a_car_that_only_yaws_has_no_swapped_axes(seed: int, tmp_path: Path) -> None:
+    """Seen once a second: what odometry says of its roll and pitch is mostly noise."""
+    drive = simulate_points("street", seed, duration_s=100.0, rate_hz=1.0, speed_mps=5.0).save(tmp_path / "drive.npz")
+    run(open_source(drive), tmp_path / "run")
+    require_sane(flight_of(read_run(tmp_path / "run")))
 
 
 def test_a_clock_that_is_off_by_more_than_is_tried(flight: Flight) -> None:
