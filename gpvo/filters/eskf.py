@@ -54,7 +54,7 @@ from gpvo.types import STANDARD_GRAVITY_MPS2, Array, ImuNoise, MotionError
 _POSE = np.array([0, 1, 2, 6, 7, 8])  # position and attitude inside the core
 _STATE = CLONE.stop  # core and clone; what follows is VO's
 _MOST_SPEED_VAR, _MOST_ANGLE_VAR = 100.0, 0.1  # (10 m/s)^2, (18 deg)^2: no state is doubted beyond
-_FAR_M, _ROUNDINGS = 3e5, 64.0
+_SPOILT, _SMALL, _ROUNDINGS = 0.01, 1e-3, 64.0  # share of a variance that rounding may be; how many roundings add up
 _UNSEEN_TURN_RAD, _UNSEEN_TILT_RAD = 1.0, 0.2  # about and from the vertical, while nothing is heard
 
 
@@ -231,12 +231,10 @@ class ErrorStateFilter:
         """
         r = residual - (H @ self.dx[:, :, None])[:, :, 0]
         PHt = self.P @ transpose(H)
-        R = R + self._rounding(H, _FAR_M)
-        try:
-            L = np.asarray(np.linalg.cholesky(S := H @ PHt + R), dtype=np.float64)
-        except np.linalg.LinAlgError:
-            R = R + self._rounding(H, 0.0)
-            L = np.asarray(np.linalg.cholesky(S := H @ PHt + R), dtype=np.float64)
+        HPHt = H @ PHt
+        R = R + self._rounding(H, HPHt, R)
+        S = HPHt + R
+        L = np.asarray(np.linalg.cholesky(S), dtype=np.float64)
         whitened: Array = np.linalg.solve(L, np.concatenate([transpose(PHt), r[:, :, None]], axis=2))
         z = whitened[:, :, -1]
         nis = (z * z).sum(1)
@@ -262,12 +260,13 @@ class ErrorStateFilter:
             self.dx += (K @ r[:, :, None])[:, :, 0]
         return Innovation(r, S, nis, passed, used, own_fault)
 
-    def _rounding(self, H: Array, from_m: float) -> Array:
-        """(B, m, m) by what a motion is read off less well where the place, which it does not depend on, is so unsure
-        that its variance leaves the motion's own too few digits; zero up to a sigma of ``from_m``."""
-        largest = variances(self.P)[:, P].max(axis=1)
-        lost = np.where(largest > from_m**2, _ROUNDINGS * np.finfo(float).eps * largest, 0.0)
-        return np.asarray((lost[:, None] * np.square(H[:, :, P]).sum(axis=2))[:, :, None] * np.eye(H.shape[1]))
+    def _rounding(self, H: Array, HPHt: Array, R: Array) -> Array:
+        """(B, m, m) by what a motion is read off less well where it is the small difference of two places, so unsure
+        that their variance leaves its own too few digits; zero where these are enough."""
+        places = variances(self.P)[:, P].max(axis=1)[:, None] * np.square(H[:, :, P]).sum(axis=2)
+        lost = np.finfo(float).eps * places
+        spoilt = ((lost > _SPOILT * variances(R)) & (variances(HPHt) < _SMALL * places)).any(axis=1)
+        return np.asarray((_ROUNDINGS * spoilt[:, None] * lost)[:, :, None] * np.eye(H.shape[1]))
 
     def _own_part(self, H: Array, S: Array, r: Array) -> Array:
         """How much of the NIS (B,) state and clone have to answer for (see the gate's ``Wait``)."""

@@ -126,10 +126,13 @@ def test_a_considered_bias_counts_but_is_not_estimated() -> None:
     assert 0.5 * added < sigma < 1.25 * added
 
 
-@pytest.mark.parametrize("sigma_m", [1e3, 1e5, 1e6, 1e7, 1e8])
-def test_motions_are_used_wherever_the_vehicle_may_be(sigma_m: float) -> None:
+@pytest.mark.parametrize("precise", [1.0, 0.01])
+@pytest.mark.parametrize("sigma_m", [1e3, 1e4, 1e5, 1e6, 1e7, 1e8])
+def test_motions_are_used_wherever_the_vehicle_may_be(sigma_m: float, precise: float) -> None:
     """As after an hour by the IMU alone: motions go on telling how it moves, as well as rounding lets them."""
-    flight = synthetic_flight(3, duration_s=6)
+    usual = ErrorLaw()
+    law = ErrorLaw(precise * usual.jitter, precise * usual.white, precise * usual.bias)
+    flight = synthetic_flight(3, duration_s=6, law=law)
     assert flight.imu is not None
     start, gravity = begin(flight, FuseOptions())
     filter = make_filter(flight, start, gravity, 1, FuseOptions())
