@@ -18,6 +18,9 @@ _EXTRAS = {
 EXTRA_OF = {package: extra for extra, packages in _EXTRAS.items() for package in packages}
 """Which extra of gpvo brings a package."""
 
+NO_TRUTH = "'gpvo import RUN --truth GT -o NEW' gives it some; --twins needs none, for a run with tracks"
+"""The cure of a run without ground truth."""
+
 
 def printable(text: object) -> str:
     """Text without what a terminal would obey: control and formatting characters become ``?``."""

@@ -13,6 +13,7 @@ from gpvo.cli import common as options
 from gpvo.cli.describe import as_lines, describe
 from gpvo.cli.output import Json, answer, note, numbers, one_of, progress
 from gpvo.cli.output import time_offset as read_offset
+from gpvo.dataset.build import aligned
 from gpvo.dataset.clock import estimate_time_offset
 from gpvo.dataset.errors import interpolate_truth
 from gpvo.dataset.hand_eye import FixedTransform, align_frames
@@ -20,9 +21,11 @@ from gpvo.errors import GpvoError, SourceError
 from gpvo.files import plain
 from gpvo.io.foreign import T_FLU_OPTICAL, ForeignLog, check_same_rows, read_foreign
 from gpvo.io.foreign_csv import NO_HEADER
-from gpvo.io.run import write_run
+from gpvo.io.run import Run, copy_run, read_run, write_run
+from gpvo.io.run_read import is_run
 from gpvo.io.stated import to_records
 from gpvo.io.trajectory import check_overlap
+from gpvo.online.slip import flag_slips
 from gpvo.types import Mounting, TruthLog, Vehicle, VoLog
 
 
@@ -45,7 +48,7 @@ class ImportSummary:
         if self.methods:
             parts.append(f"covariances: {', '.join(self.methods)}")
         if self.time_offset_s:
-            parts.append(f"stamps shifted by {self.time_offset_s:+.4f} s")
+            parts.append(f"time offset {self.time_offset_s:+.4f} s")
         if self.rotation_deg is not None:
             parts.append(f"truth rotated by {self.rotation_deg:.2f} deg")
         if self.lever_m:
@@ -78,11 +81,10 @@ def import_log(
     """
     frame = _frame(log) if frame == "auto" else frame
     place = T_FLU_OPTICAL if frame == "body" else np.eye(4)
-    log, given, assumed = log.seen_from(place), None, list[str]()
+    log, given = log.seen_from(place), None
     if truth is not None:
         check_same_rows(truth, log)
         sigma = truth_sigma or (0.0, 0.0)
-        assumed = [f"{truth.path.name}: {n}" for n in truth.notes if n == NO_HEADER]
         given = TruthLog(truth.t_ns, truth.seen_from(place).trajectory.T_world_body, *sigma)
     if time_offset_s is None:
         if given is None:
@@ -90,16 +92,13 @@ def import_log(
         time_offset_s = estimate_time_offset(VoLog(to_records(log)[0]), given)
     log = log.shifted(time_offset_s) if time_offset_s else log
     records, notes = to_records(log)
-    notes += assumed
+    notes += _assumed(truth)
     read = truth.topic if truth is not None and truth.path.resolve() == log.path.resolve() else None
     if unread := ", ".join(t for t in log.other_topics if t != read):
         notes.append(f"poses on {unread} are not used: --topic takes them as the odometry, --truth-topic as truth")
     fixed: FixedTransform | None = None
     if given is not None and truth is not None:
-        check_overlap(given, log.t_ns, truth.path, " --time-offset auto finds what lies between two clocks")
-        if align != "none":
-            fixed = align_frames(VoLog(records), given, align)
-            given = replace(given, T_world_cam=fixed.in_log_frame(given.T_world_cam))
+        given, fixed = _fitted(VoLog(records), given, truth.path, align)
     meta: dict[str, Any] = {"source": log.path.name, "format": "import", "kind": "import"}
     write_run(
         out,
@@ -110,11 +109,60 @@ def import_log(
         config={"import": {"frame": frame, "align": align, "time_offset_s": time_offset_s}},
         meta=meta | {"notes": notes, "vehicle": asdict(vehicle or Vehicle())},
     )
+    return _summary(VoLog(records), given, time_offset_s, fixed, notes)
+
+
+def add_truth(
+    run: Run,
+    truth: ForeignLog | None,
+    out: Path,
+    *,
+    align: str = "none",
+    time_offset_s: float | None = 0.0,
+    truth_sigma: tuple[float, float] | None = None,
+    overwrite: bool = True,
+) -> ImportSummary:
+    """Copy a run of gpvo's own odometry with ground truth of its rectified left camera, by default with its own truth.
+
+    ``align``, ``time_offset_s``: as for :func:`import_log`, but truth is moved, to the clock and frame of the run, whose
+    records, IMU and tracks stay as they are. Raises SourceError: one line that names the file, the place and the cure.
+    """
+    given, path = run.truth, run.path
+    if truth is not None:
+        given, path = TruthLog(truth.t_ns, truth.trajectory.T_world_body), truth.path
+    if given is None or (truth is None and align == "none" and time_offset_s == 0.0):
+        cure = "give it with --truth, or fit its own with --align or --time-offset"
+        raise SourceError("a run is imported to give it ground truth", where=run.path, cure=cure)
+    if truth_sigma is not None:
+        given = TruthLog(given.t_ns, given.T_world_cam, *truth_sigma)
+    run, offset_s = aligned(replace(run, truth=given), "none", time_offset_s)
+    given, fixed = _fitted(flag_slips(run.log), run.truth or given, path, align)
+    origin = {"file": path.name, "align": align, "time_offset_s": offset_s}
+    copy_run(run, out, given, {"truth": origin}, overwrite=overwrite)
+    return _summary(run.log, given, offset_s, fixed, _assumed(truth))
+
+
+def _assumed(truth: ForeignLog | None) -> list[str]:
+    return [] if truth is None else [f"{truth.path.name}: {n}" for n in truth.notes if n == NO_HEADER]
+
+
+def _fitted(log: VoLog, truth: TruthLog, path: Path, align: str) -> tuple[TruthLog, FixedTransform | None]:
+    """The truth from ``path`` in the frame of the log, and what took it there."""
+    check_overlap(truth, log.t_ns, path, " --time-offset auto finds what lies between two clocks")
+    if align == "none":
+        return truth, None
+    fixed = align_frames(log, truth, align)
+    return replace(truth, T_world_cam=fixed.in_log_frame(truth.T_world_cam)), fixed
+
+
+def _summary(
+    log: VoLog, truth: TruthLog | None, offset_s: float, fixed: FixedTransform | None, notes: list[str]
+) -> ImportSummary:
     return ImportSummary(
-        frames=len(records),
-        methods=list(VoLog(records).methods),
-        with_truth=0 if given is None else int(interpolate_truth(given, log.t_ns)[1].sum()),
-        time_offset_s=time_offset_s,
+        frames=len(log),
+        methods=list(log.methods),
+        with_truth=0 if truth is None else int(interpolate_truth(truth, log.t_ns)[1].sum()),
+        time_offset_s=offset_s,
         rotation_deg=None if fixed is None else fixed.angle_deg,
         lever_m=None if fixed is None else fixed.lever_m,
         worlds_deg=None if fixed is None else fixed.worlds_deg,
@@ -149,7 +197,7 @@ def info(
 
 
 def import_(
-    log: Annotated[Path, "Trajectory, CSV or bag of another odometry."],
+    log: Annotated[Path, "Trajectory, CSV or bag of another odometry; or a run, to give it ground truth."],
     out: Annotated[Path, "Run folder to write."],
     truth: Annotated[Path | None, "Ground truth: a trajectory, CSV or bag."] = None,
     format_: Annotated[str | None, "tum, kitti, csv or bag; guessed by default."] = None,
@@ -180,7 +228,7 @@ def import_(
     overwrite: options.Overwrite = False,
     json_: Json = False,
 ) -> None:
-    """Turn another odometry's log into a run folder.
+    """Turn another odometry's log into a run folder; give any run ground truth.
 
     Example: gpvo import 00_est.txt --truth 00_gt.txt -o runs/kitti00
     """
@@ -197,19 +245,23 @@ def import_(
     stated: dict[str, Any] = {"covariance_of": covariance_of, "covariance_axes": covariance_axes}
     of_truth: dict[str, Any] = {"mapping": truth_mapping, "topic": truth_topic, "complete": True}
     read = partial(read_foreign, times=times, rate_hz=rate_hz)
+    fit: dict[str, Any] = {"align": align, "time_offset_s": offset, "truth_sigma": sigma, "overwrite": overwrite}
     with progress("logs", 1):
-        summary = import_log(
-            read(log, format_, mapping=mapping, topic=topic, **stated),
-            None if truth is None else read(truth, truth_format, **of_truth),
-            out,
-            frame=frame,
-            align=align,
-            time_offset_s=offset,
-            truth_sigma=sigma,
-            vehicle=vehicle.bounds(),
-            overwrite=overwrite,
-        )
+        given = None if truth is None else read(truth, truth_format, **of_truth)
+        if is_run(log):
+            _refuse_of_a_run(log, {"frame": frame != "auto", "format": format_, "map": map_, "topic": topic})
+            summary = add_truth(read_run(log), given, out, **fit)
+        else:
+            foreign = read(log, format_, mapping=mapping, topic=topic, **stated)
+            summary = import_log(foreign, given, out, frame=frame, vehicle=vehicle.bounds(), **fit)
     answer(json_, {"schema": 1, "run": str(out), **vars(summary)}, lambda: print(f"{out}: {summary}"))
+
+
+def _refuse_of_a_run(run: Path, given: dict[str, Any]) -> None:
+    """Refuse what says how a file is read: a run knows, and its poses are those of its left camera."""
+    for name in (name for name, value in given.items() if value):
+        cure = "leave it out; --align transform fits a truth of another frame"
+        raise SourceError(f"--{name} has no effect on a run", where=run, cure=cure)
 
 
 def _mapping(option: str, texts: list[str]) -> dict[str, str]:

@@ -16,7 +16,7 @@ from gpvo.dataset.clock import estimate_time_offset, on_clock_of_log
 from gpvo.dataset.doubtful import false_motions, in_waits, odd_stretches
 from gpvo.dataset.errors import motion_targets, position_targets, require_attitude
 from gpvo.dataset.hand_eye import align_frames, windowed_motions
-from gpvo.errors import GpvoError
+from gpvo.errors import NO_TRUTH, GpvoError
 from gpvo.io.run_read import Run, read_run
 from gpvo.online.base import RESIDUAL_COLUMN, positions
 from gpvo.online.features import resolve
@@ -130,8 +130,7 @@ def build(
             raise GpvoError(f"unknown treatment of {what}: '{way}'", cure="drop or keep")
     names = tuple(columns or (*resolve("full"), RESIDUAL_COLUMN))
     if truth is None or len(truth.t_ns) < 2:
-        cure = "run a sequence that has it, gpvo import --truth, or --twins for a run made with --keep-tracks"
-        raise GpvoError("has no ground truth to learn from", where=where or name, cure=cure)
+        raise GpvoError("has no ground truth to learn from", where=where or name, cure=NO_TRUTH)
     if target != "position":
         require_attitude(log, truth, where or name)
         _require_one_unit(log, truth, where or name)

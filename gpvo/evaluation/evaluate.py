@@ -27,7 +27,7 @@ from gpvo.dataset.errors import (
     velocity_path,
 )
 from gpvo.dataset.misread import FixedRotation, InversePoses, Misread, Resemblance, late_by
-from gpvo.errors import SourceError
+from gpvo.errors import NO_TRUTH, SourceError
 from gpvo.evaluation.consistency import BY_MODEL, Consistency, consistency
 from gpvo.evaluation.statements import Statement, statements
 from gpvo.evaluation.trajectory import (
@@ -255,8 +255,7 @@ def judged(log: VoLog, predictions: Mapping[int, Prediction]) -> VoLog:
 def _truth(run: Run, options: EvaluateOptions) -> tuple[TruthLog, float]:
     run, offset_s = aligned(run, options.align, options.time_offset_s)
     if run.truth is None:
-        cure = "give --truth FILE, TUM lines, or --twins for a run made with --keep-tracks"
-        raise SourceError("has no ground truth", where=run.path, cure=cure)
+        raise SourceError("has no ground truth", where=run.path, cure=NO_TRUTH)
     return run.truth, offset_s
 
 

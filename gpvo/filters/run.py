@@ -9,7 +9,7 @@ from typing import Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from gpvo.errors import GpvoError
+from gpvo.errors import NO_TRUTH, GpvoError
 from gpvo.filters import metrics
 from gpvo.filters.eskf import ErrorStateFilter
 from gpvo.filters.measurement import Gate
@@ -27,7 +27,6 @@ Progress = Callable[[str], None]
 
 # Truth whose vertical is measured further than this from +z, in sigmas, is in another frame: gravity is as measured.
 _LEVEL_SIGMAS = 3.0
-_NO_TRUTH = "use --twins for a run with tracks, gpvo import --truth for a log"
 _SHORTEST_PATH_M = 0.1  # of which a drift is a part
 _TOLD_EACH = 100  # records
 _IMU_MARGIN_NS = 100_000_000  # that an IMU log begins after or ends before the images is usual
@@ -152,12 +151,12 @@ def begin(flight: Flight, options: FuseOptions) -> tuple[Start, Array | None]:
     t_ns = VoLog(flight.records).t_ns[valid]
     if options.init == "static":
         if flight.imu is None:
-            cure = "use --init truth" if flight.has_truth else _NO_TRUTH
+            cure = "use --init truth" if flight.has_truth else NO_TRUTH
             raise GpvoError("a static start needs an IMU", where=flight.name, cure=cure)
         if not flight.has_truth:
             return from_rest(flight.imu, flight.records[flight.first].t_ns, sigmas), None
     elif not flight.has_truth:
-        cure = _NO_TRUTH if flight.imu is None else f"{_NO_TRUTH}, or --init static"
+        cure = NO_TRUTH if flight.imu is None else f"{NO_TRUTH}; nor does --init static"
         raise GpvoError("--init truth needs ground truth", where=flight.name, cure=cure)
     elif len(valid) < 2:
         raise GpvoError("ground truth covers fewer than two frames", where=flight.name, cure="use --init static")

@@ -139,7 +139,8 @@ class BagSource(ImageSource):
             cure = "; ".join(filter(None, (error.cure, "--truth-topic none ignores it")))
             raise SourceError(error.what, where=error.where, cure=cure) from None
         if frame == "imu" and self.mounting.T_imu_cam is None:
-            raise CalibrationError("does not say where the IMU sits", where=self.path, cure="use --truth-frame cam")
+            cure = "give --calibration CAMCHAIN with T_cam_imu, or --truth-frame cam"
+            raise CalibrationError("does not say where the IMU sits", where=self.path, cure=cure)
         whose = frame or ("cam" if self.mounting.T_imu_cam is None else "imu")
         place = self.rectifier.T_left_cam if whose == "cam" else self.mounting.T_imu_cam
         assert place is not None

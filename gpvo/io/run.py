@@ -38,6 +38,7 @@ __all__ = [
     "Run",
     "RunWriter",
     "as_stored",
+    "copy_run",
     "is_finished",
     "read_predictions",
     "read_run",
@@ -89,9 +90,8 @@ class RunWriter:
         self.path = self._target
         if is_finished(self._target):
             if not overwrite:
-                cure = "give --overwrite, or another folder with -o"
-                raise SourceError("holds a finished run", where=path, cure=cure)
-            self.path = self._target.with_name(f".{self._target.name}.new")
+                raise run_folder.finished(path)
+            self.path = run_folder.beside(self._target)
         self._chunks, self._resume = self.path / "chunks", resume
         self.kept = None if resume is None else run_folder.take_up(self._chunks, resume)
         if self.kept is not None:
@@ -270,6 +270,36 @@ def write_run(path: str | Path, log: VoLog, *, predictions: Sequence[Prediction]
     with RunWriter(path, camera=log.camera, chunk=1000, **known) as writer:
         for record in log:
             writer.append(record, by_stamp.get(record.t_ns))
+
+
+def copy_run(
+    run: Run, path: str | Path, truth: TruthLog, meta: Mapping[str, Any] | None = None, *, overwrite: bool = True
+) -> None:
+    """Write a finished run once more, into its own folder or another, with another ground truth; all else is copied.
+
+    ``meta``: further keys of ``run.json``. Raises SourceError where the run broke off, or as :class:`RunWriter` does.
+    """
+    if run.meta.get("complete") is not True:
+        cure = "end it first: the same 'gpvo run' goes on where it stopped"
+        raise SourceError("broke off before its end", where=run.path, cure=cure)
+    target = Path(path).resolve()
+    lock, new = run_folder.claim(target), run_folder.beside(target)
+    try:
+        if not is_finished(target):
+            run_folder.prepare(target, keep_chunks=False)
+        elif not overwrite:
+            raise run_folder.finished(path)
+        run_folder.prepare(new, keep_chunks=False)
+        for file in run_folder.files_of(run.path):
+            shutil.copyfile(file, new / file.name)
+        run_folder.write_truth(new / "truth.parquet", truth)
+        digests = run.meta.get("digests") or {}
+        digests = digests | {"truth.parquet": digest_of_file(new / "truth.parquet")}
+        write_json(new / "run.json", {**run.meta, "name": target.name, **(meta or {}), "digests": digests})
+        run_folder.put_in_place(new, target)
+    finally:
+        shutil.rmtree(new, ignore_errors=True)
+        lock.release()
 
 
 def write_predictions(path: str | Path, predictions: Iterable[Prediction]) -> None:

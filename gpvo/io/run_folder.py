@@ -69,6 +69,21 @@ def is_finished(path: Path) -> bool:
         return False
 
 
+def finished(path: str | Path) -> SourceError:
+    """What refuses a folder with a finished run that may not be replaced."""
+    return SourceError("holds a finished run", where=path, cure="give --overwrite, or another folder with -o")
+
+
+def beside(path: Path) -> Path:
+    """Where a new run is written that is to replace a finished one."""
+    return path.with_name(f".{path.name}.new")
+
+
+def files_of(path: Path) -> list[Path]:
+    """The files of a finished run, without what else may lie in its folder."""
+    return [file for name in _OWN if (file := path / name).is_file()]
+
+
 def claim(path: Path) -> FolderLock:
     """Make the folder, for one writer."""
     if path.exists() and not path.is_dir():

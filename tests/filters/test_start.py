@@ -192,13 +192,13 @@ def test_the_velocity_of_sparse_truth_is_as_unsure_as_its_path_bends() -> None:
 def test_missing_inputs_are_one_line() -> None:
     flight = synthetic_flight(3, duration_s=2)
     blind = replace(flight, T_world_cam=None, truth_valid=None)
-    with pytest.raises(GpvoError, match="needs ground truth.*use --twins .*gpvo import --truth.*or --init static"):
+    with pytest.raises(GpvoError, match="needs ground truth.*gpvo import RUN --truth .*--twins .*nor does --init static"):
         begin(blind, FuseOptions())
     with pytest.raises(GpvoError, match="needs an IMU.*use --init truth"):
         begin(replace(flight, imu=None), FuseOptions(init="static"))
     # With neither, each start would send to the other.
     for init in ("truth", "static"):
-        with pytest.raises(GpvoError, match=r"\(use --twins for a run with tracks, gpvo import --truth for a log\)"):
+        with pytest.raises(GpvoError, match=r"gpvo import RUN --truth .*--twins needs none, for a run with tracks\)"):
             begin(replace(blind, imu=None), FuseOptions(init=init))
 
 
