@@ -189,7 +189,10 @@ class SequenceOptions(ViewOptions):
     rate_hz: Annotated[float | None, "Frame rate of an image folder whose file names are numbers."] = None
     imu_topic: Annotated[str | None, "Topic of the IMU in a bag."] = None
     truth_topic: Annotated[str | None, "Topic of the ground truth in a bag; none to ignore it."] = None
-    truth_frame: Annotated[str | None, "Frame of the poses in the truth topic: imu or cam; fit others with 'gpvo import RUN --align transform'."] = None
+    truth_frame: Annotated[
+        str | None,
+        "Frame of the poses in the truth topic: imu or cam; fit others with 'gpvo import RUN --align transform'.",
+    ] = None
 
 
 @dataclass(frozen=True)

@@ -122,10 +122,10 @@ def add_truth(
     truth_sigma: tuple[float, float] | None = None,
     overwrite: bool = True,
 ) -> ImportSummary:
-    """Copy a run of gpvo's own odometry with ground truth of its rectified left camera, by default with its own truth.
+    """Copy a run with ground truth of its rectified left camera, by default with its own.
 
-    ``align``, ``time_offset_s``: as for :func:`import_log`, but truth is moved, to the clock and frame of the run, whose
-    records, IMU and tracks stay as they are. Raises SourceError: one line that names the file, the place and the cure.
+    ``align``, ``time_offset_s``: as for :func:`import_log`, but it is truth that is moved, to the run's clock and
+    frame: records, IMU and tracks stay as they are. Raises SourceError: one line that names the file, the place and the cure.
     """
     given, path = run.truth, run.path
     if truth is not None:

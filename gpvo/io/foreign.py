@@ -29,6 +29,7 @@ FORMATS = ("tum", "kitti", "csv", "bag")
 T_FLU_OPTICAL: Array = se3.from_rt(R_FLU_OPTICAL, np.zeros(3))
 # What a step adds to a variance, beyond rounding: of the variance, and of the least that is seen.
 _GROWS, _GROWS_SEEN = 1e-6, 1e-3
+_NAMED = 12  # columns in a remark
 NONE_STATED = "its covariances are not positive definite and were left out"
 
 
@@ -202,7 +203,9 @@ def _unused(table: Table, covariance: Array | None) -> tuple[str, ...]:
     """A remark on columns that state an uncertainty and that nothing reads."""
     notes = []
     if table.unused:
-        notes.append(f"columns not used: {', '.join(table.unused)}; --map COLUMN=cov_00 takes a variance, see --help")
+        more = f" and {len(table.unused) - _NAMED} more" if len(table.unused) > _NAMED else ""
+        named = ", ".join(table.unused[:_NAMED]) + more
+        notes.append(f"columns not used: {named}; --map COLUMN=cov_00 takes a variance, see --help")
     if covariance is None and any(c.startswith("cov_") for c in table.columns):
         absent = ", ".join(f"cov_{i}{i}" for i in range(6) if f"cov_{i}{i}" not in table.columns)
         notes.append(f"the covariance is not used: it has no {absent}; --map COLUMN=NAME names them")

@@ -41,7 +41,12 @@ NO_HEADER = (
 POSITIONS_ALONE = (
     "positions alone, of a laser tracker or satellites, still give the ATE: write 0, 0, 0, 1 as q_x, q_y, q_z, q_w"
 )
+_ANGLES = (
+    "attitudes are read as quaternions alone: scipy's Rotation.from_euler('xyz', [roll, pitch, yaw]).as_quat() makes"
+    " them, x, y, z, w, of rotations about fixed axes (degrees=True if they are)"
+)
 _MAX_ROWS = 20_000_000
+_EMPTY = {"", "na", "n/a", "none", "null"}  # how an unknown number is written, beside NaN
 _AXES = {
     name: i % 6
     for i, name in enumerate(
@@ -90,19 +95,23 @@ def read_table(path: Path, mapping: Mapping[str, str]) -> Table:
     for number, fields in lines:
         if len(rows) >= _MAX_ROWS:
             raise SourceError(f"has more than {_MAX_ROWS} rows", where=path)
-        if len(fields) < len(header):
-            raise SourceError(f"line {number} holds {len(fields)} fields, the header {len(header)}", where=path)
+        if len(fields) < len(header) or any(fields[len(header) :]):  # empty: VINS ends its lines with a comma
+            cure = None if len(fields) < len(header) else "name every column, and write numbers with a decimal point"
+            what = f"line {number} holds {len(fields)} fields, the header {len(header)}"
+            raise SourceError(what, where=path, cure=cure)
         text = fields[targets[stamp]]
         try:
             stamps.append(_stamp(text, stamp[2:], is_stated) + (0 if rest is None else integer_ns(fields[rest])))
         except ValueError as error:
             unit = likely_unit(text)
-            cure = None if unit is None or f"t_{unit}" == stamp else _unit_cure(column, unit)
+            cure = _cure_of(text) if unit is None or f"t_{unit}" == stamp else _unit_cure(column, unit)
             raise SourceError(f"line {number}: {error}", where=path, cure=cure) from None
         try:
-            rows.append([float(fields[targets[name]] or "nan") for name in order])
-        except ValueError as error:
-            raise SourceError(f"line {number}: {error}", where=path) from None
+            values = [fields[targets[name]] for name in order]
+            rows.append([float("nan" if v.lower() in _EMPTY else v) for v in values])
+        except ValueError:
+            wrong = next(v for v in values if v.lower() not in _EMPTY and not is_number(v))
+            raise SourceError(f"line {number}: '{wrong}' is not a number", where=path, cure=_cure_of(wrong)) from None
         numbers.append(number)
     if not rows:
         raise SourceError("holds a header and no rows", where=path)
@@ -148,7 +157,8 @@ def _implied_header(path: Path, text: str, separator: str) -> list[str]:
     unit = likely_unit(fields[0]) or "s"
     if separator == "," and len(fields) in (8, 11) and unit == "ns" and all(map(is_number, fields)):
         return list(_VINS[: len(fields)])
-    names = separator.join((f"t_{unit}", *_POSE))
+    others = [f"column_{k}" for k in range(len(_POSE) + 2, len(fields) + 1)]
+    names = separator.join((f"t_{unit}", *_POSE, *others))
     cure = f"put the column names on top, in order, such as '{names}'; any other column may have any name"
     raise SourceError("has no header line", where=path, cure=cure)
 
@@ -204,7 +214,9 @@ def _targets(path: Path, header: list[str], mapping: Mapping[str, str]) -> dict[
     if absent:
         text = f"no column for {', '.join(absent)} (there are: {', '.join(header)})"
         cure = f"name it with --map COLUMN={absent[0]}, for ground truth with --truth-map"
-        if absent == list(_POSE[3:]):
+        if {"roll", "pitch", "yaw"} <= {_plain(c).removesuffix("_deg").removesuffix("_rad") for c in header}:
+            cure = _ANGLES
+        elif absent == list(_POSE[3:]):
             cure += f"; {POSITIONS_ALONE}"
         raise SourceError(text, where=path, cure=cure)
     return found
@@ -217,7 +229,7 @@ def _is_plain(column: str) -> bool:
 
 def _plain(column: str) -> str:
     """The name of a column in small letters with underscores, without a unit in brackets."""
-    return re.sub(r"[./]", "_", re.sub(r"[\[(].*?[\])]", "", column).strip().lower()).lstrip("#%").strip("_")
+    return re.sub(r"[./ ]+", "_", re.sub(r"[\[(].*?[\])]", "", column).strip().lower()).lstrip("#%").strip("_")
 
 
 def _rest_of_seconds(header: list[str], column: str) -> int | None:
@@ -240,7 +252,9 @@ def _suggest(column: str) -> str | None:
     if named := _COVARIANCE.fullmatch(name) or _VARIANCE.fullmatch(name):
         i, j = (_AXES[named[k]] for k in (1, named.lastindex or 1))
         return f"cov_{min(i, j)}{max(i, j)}"
-    if covariance := re.fullmatch(r"(?:field_)?pose_covariance_?(\d+)_?", name):
+    # The 36 numbers of ROS, row by row; a number in brackets is no unit.
+    flat = re.sub(r"\[(\d+)\]$", r"_at_\1", column.strip())
+    if covariance := re.fullmatch(r"(?:(?:.*_)?pose_covariance_?(?:at_)?|cov(?:ariance)?_at_)(\d+)_?", _plain(flat)):
         k = int(covariance[1])
         return f"cov_{k // 6}{k % 6}" if k < 36 else None
     pose = re.fullmatch(
@@ -254,6 +268,14 @@ def _suggest(column: str) -> str | None:
     if pose[2] == "w" and not is_quaternion:
         return None
     return f"{'q' if is_quaternion else 'p'}_{pose[2]}"
+
+
+def _cure_of(text: str) -> str | None:
+    """What to do about a field that is no number; None where it does not show what it is."""
+    if is_number(text.replace(",", ".")):
+        return "write numbers with a decimal point"
+    is_date = re.match(r"\d{4}-\d\d-\d\d|\d\d?:\d\d:", text) is not None
+    return "dates are not read: write seconds or nanoseconds since 1970" if is_date else None
 
 
 def _unit_cure(column: str, unit: str) -> str:

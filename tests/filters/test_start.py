@@ -192,7 +192,7 @@ def test_the_velocity_of_sparse_truth_is_as_unsure_as_its_path_bends() -> None:
 def test_missing_inputs_are_one_line() -> None:
     flight = synthetic_flight(3, duration_s=2)
     blind = replace(flight, T_world_cam=None, truth_valid=None)
-    with pytest.raises(GpvoError, match="needs ground truth.*gpvo import RUN --truth .*--twins .*nor does --init static"):
+    with pytest.raises(GpvoError, match="ground truth.*gpvo import RUN --truth .*--twins .*nor does --init static"):
         begin(blind, FuseOptions())
     with pytest.raises(GpvoError, match="needs an IMU.*use --init truth"):
         begin(replace(flight, imu=None), FuseOptions(init="static"))

@@ -10,7 +10,7 @@ import sequences as seq
 from bag_maker import BagMaker, stereo_bag
 from gpvo.cameras.readers import read_stereo_yaml
 from gpvo.cli.files import import_log
-from gpvo.errors import CalibrationError
+from gpvo.errors import CalibrationError, SourceError
 from gpvo.io import open_source
 from gpvo.io.foreign import read_foreign
 
@@ -100,3 +100,63 @@ def test_calibration_takes_kittis_calib(tmp_path: Path) -> None:
     assert source.camera.baseline_m == pytest.approx(0.1)
     with pytest.raises(CalibrationError, match="image size"):
         read_stereo_yaml(tmp_path / "calib.txt")
+
+
+@pytest.mark.parametrize("name", ["cov[{}]", "covariance[{}]", "pose.covariance[{}]", "/odom/pose/covariance[{}]"])
+def test_the_36_numbers_of_ros_by_their_place_in_the_row(name: str, tmp_path: Path) -> None:
+    C = np.diag([1.0, 2, 3, 4, 5, 6]) + 0.1 * np.arange(1, 7)[:, None] @ np.arange(1, 7)[None] / 6
+    names, values = ",".join(name.format(k) for k in range(36)), ",".join(repr(float(v)) for v in C.ravel())
+    log = read_foreign(_csv(tmp_path / "log.csv", names, values))
+    assert log.covariance is not None
+    np.testing.assert_allclose(log.covariance[2], C, rtol=1e-12)
+    assert log.notes == ()
+
+
+def test_of_a_twist_they_are_not_the_poses(tmp_path: Path) -> None:
+    names = ",".join(f"twist.covariance[{k}]" for k in range(36))
+    log = read_foreign(_csv(tmp_path / "log.csv", names, ",".join(["1"] * 36)))
+    assert log.covariance is None
+    [note] = log.notes
+    assert note.count("twist") == 12
+    assert "and 24 more" in note
+
+
+HEAD = "t,pos x [m],pos y [m],pos z [m],qx,qy,qz,qw"
+
+
+@pytest.mark.parametrize("word", ["", "NA", "None", "null", "N/A", "NaN"])
+def test_what_stands_for_no_number_costs_its_row_alone(word: str, tmp_path: Path) -> None:
+    path = tmp_path / "log.csv"
+    path.write_text(f"{HEAD}\n0.0,{POSE}\n0.1,0,{word},0,0,0,0,1\n0.2,{POSE}\n")
+    log = read_foreign(path)
+    np.testing.assert_array_equal(log.t_ns, [0, 200_000_000])
+    assert log.notes == ("1 rows without a pose were left out",)
+
+
+@pytest.mark.parametrize(
+    ("text", "cure"),
+    [
+        (f"{HEAD.replace(',', ';')}\n0,1;0;0;0;0;0;0;1\n", r"line 2: '0,1' is not a number \(.*decimal point"),
+        (f"{HEAD.replace(',', ';')}\n0.1;0,5;0;0;0;0;0;1\n", r"line 2: '0,5' is not a number \(.*decimal point"),
+        # Seven more fields than names: each would be read as its neighbour.
+        (f"{HEAD}\n0,1,0,5,0,0,0,0,0,0,0,0,0,0,1,0\n", r"line 2 holds 16 fields, the header 8 \(.*decimal point"),
+        (f"{HEAD}\n7,0.1,{POSE}\n", r"line 2 holds 9 fields, the header 8 \(name every column"),
+        (f"{HEAD}\n2020-09-13T12:26:40.5Z,{POSE}\n", r"line 2: .* is not a number \(dates are not read: write seconds"),
+        (f"{HEAD}\n12:26:40.5,{POSE}\n", r"line 2: .* is not a number \(dates are not read"),
+        (f"{HEAD}\n0,0,0,lost,0,0,0,1\n", r"line 2: 'lost' is not a number$"),
+        ("t,x,y,z,roll,pitch,yaw\n0,0,0,0,0,0,0\n", r"quaternions alone: .*from_euler\('xyz', \[roll, pitch, yaw\]\)"),
+        ("t,x,y,z,Roll [deg],pitch_deg,yaw_deg\n0,0,0,0,0,0,0\n", "quaternions alone: .*degrees=True"),
+    ],
+)
+def test_a_table_of_another_custom_is_refused_with_the_cure(text: str, cure: str, tmp_path: Path) -> None:
+    path = tmp_path / "log.csv"
+    path.write_text(text)
+    with pytest.raises(SourceError, match=cure) as caught:
+        read_foreign(path)
+    assert str(path) in str(caught.value)
+
+
+def test_vins_may_end_lines_with_a_comma(tmp_path: Path) -> None:
+    path = tmp_path / "log.csv"
+    path.write_text(f"{HEAD}\n0.0,{POSE},\n0.1,{POSE},\n")
+    assert len(read_foreign(path).t_ns) == 2
