@@ -125,7 +125,7 @@ def add_truth(
     """Copy a run with ground truth of its rectified left camera, by default with its own.
 
     ``align``, ``time_offset_s``: as for :func:`import_log`, but it is truth that is moved, to the run's clock and
-    frame: records, IMU and tracks stay as they are. Raises SourceError: one line that names the file, the place and the cure.
+    frame: records, IMU and tracks stay as they are. Raises SourceError: one line that names the file and the cure.
     """
     given, path = run.truth, run.path
     if truth is not None:
