@@ -14,9 +14,8 @@ import typer
 from gpvo.cli.common import refuse_twice
 from gpvo.cli.output import Json, cell, numbers, print_json, progress, say, show, time_offset
 from gpvo.cli.twin import TWINS, Seed, TwinOptions, make_all, say_simulated
-from gpvo.errors import GpvoError, SourceError
+from gpvo.errors import GpvoError
 from gpvo.files import in_metres, refuse_foreign
-from gpvo.io.foreign import guess_format
 from gpvo.io.run import Run, read_run
 from gpvo.io.source import open_source
 from gpvo.io.trajectory import read_tum
@@ -161,9 +160,6 @@ def _loaded(runs: list[Path], judge: JudgeOptions) -> tuple[list[Run], Predictor
     predictor = None if model is None else Predictor.load(model).require_motions(model)
     loaded = [read_run(path) for path in runs]
     if judge.truth is not None:
-        if guess_format(judge.truth) != "tum":
-            cure = "'gpvo import RUN --truth FILE -o NEW' takes CSV, KITTI and bags, and fits clock and frame"
-            raise SourceError("is not a file of TUM lines", where=judge.truth, cure=cure)
         trajectory = read_tum(judge.truth)
         loaded = [replace(run, truth=TruthLog(trajectory.t_ns, trajectory.T_world_body)) for run in loaded]
     return loaded, predictor

@@ -38,10 +38,10 @@ class ImportSummary:
     methods: list[str]
     with_truth: int
     time_offset_s: float
-    rotation_deg: float | None
-    lever_m: float | None
-    worlds_deg: float | None
     notes: list[str]
+    rotation_deg: float | None = None
+    lever_m: float | None = None
+    worlds_deg: float | None = None
 
     def __str__(self) -> str:
         parts = [f"{self.frames} records", f"{self.with_truth} with truth"]
@@ -158,16 +158,9 @@ def _fitted(log: VoLog, truth: TruthLog, path: Path, align: str) -> tuple[TruthL
 def _summary(
     log: VoLog, truth: TruthLog | None, offset_s: float, fixed: FixedTransform | None, notes: list[str]
 ) -> ImportSummary:
-    return ImportSummary(
-        frames=len(log),
-        methods=list(log.methods),
-        with_truth=0 if truth is None else int(interpolate_truth(truth, log.t_ns)[1].sum()),
-        time_offset_s=offset_s,
-        rotation_deg=None if fixed is None else fixed.angle_deg,
-        lever_m=None if fixed is None else fixed.lever_m,
-        worlds_deg=None if fixed is None else fixed.worlds_deg,
-        notes=notes,
-    )
+    known = 0 if truth is None else int(interpolate_truth(truth, log.t_ns)[1].sum())
+    fit = () if fixed is None else (fixed.angle_deg, fixed.lever_m, fixed.worlds_deg)
+    return ImportSummary(len(log), list(log.methods), known, offset_s, notes, *fit)
 
 
 def _frame(log: ForeignLog) -> str:

@@ -87,11 +87,7 @@ class RunWriter:
         self._target = Path(path).resolve()  # "." has no name, and a link would be replaced in place of its folder
         self._meta, self._chunk, self._state = dict(meta or {}), chunk, _State()
         self._lock = run_folder.claim(self._target)
-        self.path = self._target
-        if is_finished(self._target):
-            if not overwrite:
-                raise run_folder.finished(path)
-            self.path = run_folder.beside(self._target)
+        self.path = run_folder.beside(path, overwrite) if is_finished(self._target) else self._target
         self._chunks, self._resume = self.path / "chunks", resume
         self.kept = None if resume is None else run_folder.take_up(self._chunks, resume)
         if self.kept is not None:
@@ -283,14 +279,12 @@ def copy_run(
         cure = "end it first: the same 'gpvo run' goes on where it stopped"
         raise SourceError("broke off before its end", where=run.path, cure=cure)
     target = Path(path).resolve()
-    lock, new = run_folder.claim(target), run_folder.beside(target)
+    is_new = not is_finished(target)
+    new, lock = run_folder.beside(path, overwrite or is_new), run_folder.claim(target)
     try:
-        if not is_finished(target):
-            run_folder.prepare(target, keep_chunks=False)
-        elif not overwrite:
-            raise run_folder.finished(path)
-        run_folder.prepare(new, keep_chunks=False)
-        for file in run_folder.files_of(run.path):
+        for folder in (target, new) if is_new else (new,):
+            run_folder.prepare(folder, keep_chunks=False)
+        for file in (f for name in run_folder.OWN if (f := run.path / name).is_file()):
             shutil.copyfile(file, new / file.name)
         run_folder.write_truth(new / "truth.parquet", truth)
         digests = run.meta.get("digests") or {}

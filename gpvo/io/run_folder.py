@@ -24,7 +24,8 @@ FILES = (
     "vo_log.parquet", "trajectory.tum", "rig.json", "truth.parquet", "imu.parquet", "predictions.parquet",
     "tracks.parquet",
 )  # fmt: skip
-_OWN = (*FILES, "config.toml", "run.json", "calibration_state.json")
+OWN = (*FILES, "config.toml", "run.json", "calibration_state.json")
+"""All files of a run; its folder may hold others."""
 KINDS = ("log", "predictions", "tracks")
 """Tables that are written in chunks."""
 STATE = "state.npz"
@@ -69,19 +70,12 @@ def is_finished(path: Path) -> bool:
         return False
 
 
-def finished(path: str | Path) -> SourceError:
-    """What refuses a folder with a finished run that may not be replaced."""
-    return SourceError("holds a finished run", where=path, cure="give --overwrite, or another folder with -o")
-
-
-def beside(path: Path) -> Path:
-    """Where a new run is written that is to replace a finished one."""
-    return path.with_name(f".{path.name}.new")
-
-
-def files_of(path: Path) -> list[Path]:
-    """The files of a finished run, without what else may lie in its folder."""
-    return [file for name in _OWN if (file := path / name).is_file()]
+def beside(path: str | Path, overwrite: bool) -> Path:
+    """Where a new run is written that is to replace a finished one. Raises SourceError where it may not."""
+    if not overwrite:
+        raise SourceError("holds a finished run", where=path, cure="give --overwrite, or another folder with -o")
+    target = Path(path).resolve()
+    return target.with_name(f".{target.name}.new")
 
 
 def claim(path: Path) -> FolderLock:
@@ -123,7 +117,7 @@ def prepare(path: Path, *, keep_chunks: bool) -> None:
             raise SourceError("holds something that is not a run", where=path, cure="choose an empty folder with -o")
         if not keep_chunks:
             shutil.rmtree(path / "chunks", ignore_errors=True)
-        for file in (*unfinished, *(path / name for name in _OWN)):
+        for file in (*unfinished, *(path / name for name in OWN)):
             file.unlink(missing_ok=True)
     except OSError as error:
         raise OutputError(f"cannot be written: {error.strerror}", where=path) from None

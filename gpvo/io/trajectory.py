@@ -160,7 +160,8 @@ def _read_poses(
     numbers, stamps, poses, behind = [], [], [], []
     for number, fields in _fields(path, separator):
         if len(fields) not in counts:
-            raise SourceError(f"line {number} holds {len(fields)} fields, expected {what}", where=path)
+            cure = None if separator else "'gpvo import', of a log or as --truth of a run, takes CSV, KITTI and bags"
+            raise SourceError(f"line {number} holds {len(fields)} fields, expected {what}", where=path, cure=cure)
         try:
             stamps.append(stamp(fields[0]))
         except ValueError as error:

@@ -132,7 +132,7 @@ def test_a_run_that_broke_off_is_ended_first(run: Path, tmp_path: Path) -> None:
 def test_what_evaluate_does_not_read_import_does(run: Path, tmp_path: Path) -> None:
     code, _, err = _call("evaluate", run, "--truth", _truth(tmp_path / "a.csv", 0.0))
     assert code != 0
-    assert "gpvo import RUN --truth FILE" in err
+    assert "'gpvo import', of a log or as --truth of a run, takes CSV" in err
 
 
 def test_a_folder_that_is_no_run_is_left_alone(run: Path, tmp_path: Path) -> None:
