@@ -155,7 +155,9 @@ def process_noise(densities: Array, dt: float, with_imu: bool) -> Array:
 
 def constant_velocity_noise(records: Sequence[VoRecord]) -> ConstantVelocityNoise:
     """How much the vehicle's velocity and turn rate walk while it moves, from the log itself: robust spread of their
-    changes. Rest does not count: a filter that takes the vehicle to stay at rest rejects the motions of its start.
+    changes from frame to frame, or what explains the fiercest second, whichever is more. Rest does not count, and
+    cruising not alone: a filter that takes the vehicle to stay so rejects the motions of its start, which differ
+    little from frame to frame, but for long.
 
     VO's own noise is in these changes too, which errs on the wide side.
     """
@@ -165,19 +167,28 @@ def constant_velocity_noise(records: Sequence[VoRecord]) -> ConstantVelocityNois
     dt = np.array([r.dt_s for r in usable])
     end = np.array([(r.t_ns - usable[0].t_ns) * 1e-9 for r in usable])
     twist = se3.log(np.array([r.T_prev_cur for r in usable])) / dt[:, None]
-    # The means of a walk over two stretches, one after the other, differ by the variance of this much time.
-    walked = np.diff(end - 0.5 * dt) - (dt[1:] + dt[:-1]) / 6.0
-    apart = end[1:] - dt[1:] > end[:-1] - 1e-6
-    if not apart.any():
-        return ConstantVelocityNoise()
-    change = np.abs(np.diff(twist, axis=0))[apart] / np.sqrt(walked[apart, None])
     second = max(5, round(1.0 / float(np.median(dt))))
-    sigma = [
-        _walk(change[:, block].max(axis=1), np.linalg.norm(twist[1:, block], axis=1)[apart], second)
-        for block in (slice(0, 3), slice(3, 6))
-    ]
+    walks = []
+    for n, size in ((1, _walk), (second, _fiercest)):
+        # The means of a walk over two stretches, one after the other, differ by the variance of this much time.
+        walked = (end - 0.5 * dt)[n:] - (end - 0.5 * dt)[:-n] - (dt[n:] + dt[:-n]) / 6.0
+        apart = end[n:] - dt[n:] > end[:-n] - 1e-6
+        if apart.any():
+            change = np.abs(twist[n:] - twist[:-n])[apart] / np.sqrt(walked[apart, None])
+            both = (change[:, :3], twist[n:, :3][apart]), (change[:, 3:], twist[n:, 3:][apart])
+            walks.append([size(c.max(axis=1), np.linalg.norm(speed, axis=1), second) for c, speed in both])
+    if not walks:
+        return ConstantVelocityNoise()
+    sigma = np.max(walks, axis=0)
     # The least is for logs without any change: an endoscope's velocity walks by less than a millimetre per second.
     return ConstantVelocityNoise(acceleration=max(sigma[0], 1e-6), angular_acceleration=max(sigma[1], 1e-3))
+
+
+def _fiercest(change: Array, _: Array, second: int) -> float:
+    """Standard deviation of a Gaussian walk whose largest ``change`` (n,) is that of the log, by medians over a second,
+    of so many frames: what lasts for a few frames is a failure of VO."""
+    blocks = change[: len(change) // second * second].reshape(-1, second)
+    return float(np.median(blocks, axis=1).max() / np.sqrt(2.0 * np.log(2.0 * len(blocks)))) if len(blocks) else 0.0
 
 
 def _walk(change: Array, speed: Array, second: int) -> float:
