@@ -113,9 +113,10 @@ def _print_ratios(runs: Sequence[Run], twins: Sequence[Sequence[Path]], json_: b
         print_json({"schema": 1, "axes": AXES, "runs": each, "pooled": of_all})
         return
     each_run = ((name, span, row) for name, of_run in zip(names, found) for span, row in zip(SPANS, of_run))
-    rows = [[name, span, *(f"{v:.2f}" for v in row)] for name, span, row in each_run]
+    rows = [[name, span, *(f"{v:.2f}" for v in row)] for name, span, row in each_run if np.isfinite(row).any()]
     for span, m, d in zip(SPANS, mean, spread):
-        rows.append(["all (spread)", span, *(f"{v:.2f} ({w:.2f})" for v, w in zip(m, d))])
+        if np.isfinite(m).any():  # none of the runs is so long
+            rows.append(["all (spread)", span, *(f"{v:.2f} ({w:.2f})" for v, w in zip(m, d))])
     show(("run", "over", *AXES), rows)
     print("real over predicted error, root mean square; the truth's own noise is taken into account")
 

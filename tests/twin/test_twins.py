@@ -181,6 +181,9 @@ def test_ratios_of_real_errors_to_those_that_twins_predict(flown, tmp_path):
     assert all(0.4 < r < 2.5 for r in gap.ratio)
     assert gap.spread == (1.0,) * 6  # one run alone shows none
     assert json.loads(made.stdout)["pooled"]["10 m"]["ratio"] == [None] * 6
+    shown = gpvo("twin", folder / "run", "--against", "--replicates", 2).stdout
+    assert "1 s" in shown
+    assert "nan" not in shown  # a flight of less than ten metres has no row for them
     with pytest.raises(SourceError, match="no ground truth"):
         ratios(replace(real, truth=None), [])
 
