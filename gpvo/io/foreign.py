@@ -18,8 +18,8 @@ from gpvo.geometry.covariance import variances
 from gpvo.geometry.se3 import R_FLU_OPTICAL
 from gpvo.io.bag_messages import covariances_of, read_poses
 from gpvo.io.bag_reader import ODOMETRY_TYPE, POSE_TYPES, is_bag, open_bag, topics_of
-from gpvo.io.foreign_csv import POSITIONS_ALONE, Table, is_number, names_other_columns, read_table
-from gpvo.io.stamps import check_interval, text_lines
+from gpvo.io.foreign_csv import POSITIONS_ALONE, Table, names_other_columns, read_table
+from gpvo.io.stamps import check_interval, is_number, text_lines
 from gpvo.io.trajectory import REMOVE, Trajectory, check_growing, check_unit, read_kitti_poses, read_times, read_tum
 from gpvo.stats.consistency import SEEN, seen_axes
 from gpvo.types import COUNT_FIELDS, FLOAT_FIELDS, Array

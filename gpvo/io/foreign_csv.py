@@ -12,7 +12,16 @@ import numpy as np
 from numpy.typing import NDArray
 
 from gpvo.errors import SourceError
-from gpvo.io.stamps import UNITS_NS, check_interval, integer_ns, likely_unit, text_lines, text_to_ns
+from gpvo.io.stamps import (
+    UNITS_NS,
+    check_interval,
+    cure_of_number,
+    integer_ns,
+    is_number,
+    likely_unit,
+    text_lines,
+    text_to_ns,
+)
 from gpvo.types import COUNT_FIELDS, FLOAT_FIELDS, Array
 
 _POSE = ("p_x", "p_y", "p_z", "q_x", "q_y", "q_z", "q_w")
@@ -104,14 +113,15 @@ def read_table(path: Path, mapping: Mapping[str, str]) -> Table:
             stamps.append(_stamp(text, stamp[2:], is_stated) + (0 if rest is None else integer_ns(fields[rest])))
         except ValueError as error:
             unit = likely_unit(text)
-            cure = _cure_of(text) if unit is None or f"t_{unit}" == stamp else _unit_cure(column, unit)
+            cure = cure_of_number(text) if unit is None or f"t_{unit}" == stamp else _unit_cure(column, unit)
             raise SourceError(f"line {number}: {error}", where=path, cure=cure) from None
         try:
             values = [fields[targets[name]] for name in order]
             rows.append([float("nan" if v.lower() in _EMPTY else v) for v in values])
         except ValueError:
             wrong = next(v for v in values if v.lower() not in _EMPTY and not is_number(v))
-            raise SourceError(f"line {number}: '{wrong}' is not a number", where=path, cure=_cure_of(wrong)) from None
+            what = f"line {number}: '{wrong}' is not a number"
+            raise SourceError(what, where=path, cure=cure_of_number(wrong)) from None
         numbers.append(number)
     if not rows:
         raise SourceError("holds a header and no rows", where=path)
@@ -159,6 +169,8 @@ def _implied_header(path: Path, text: str, separator: str) -> list[str]:
         return list(_VINS[: len(fields)])
     others = [f"column_{k}" for k in range(len(_POSE) + 2, len(fields) + 1)]
     names = separator.join((f"t_{unit}", *_POSE, *others))
+    if len(words := text.split()) > 1 and all(re.fullmatch(r"[-+]?\d+,\d+\S*", word) for word in words):
+        raise SourceError(f"'{words[0]}' is not a number", where=path, cure=cure_of_number(words[0]))
     cure = f"put the column names on top, in order, such as '{names}'; any other column may have any name"
     raise SourceError("has no header line", where=path, cure=cure)
 
@@ -167,15 +179,6 @@ def _split(text: str, separator: str) -> list[str]:
     if separator == " ":
         return text.split()
     return [f.strip() for f in next(csv.reader([text], delimiter=separator))]
-
-
-def is_number(text: str) -> bool:
-    """Whether a field is a number, NaN included."""
-    try:
-        float(text)
-    except ValueError:
-        return False
-    return True
 
 
 def names_other_columns(words: list[str], count: int) -> bool:
@@ -268,14 +271,6 @@ def _suggest(column: str) -> str | None:
     if pose[2] == "w" and not is_quaternion:
         return None
     return f"{'q' if is_quaternion else 'p'}_{pose[2]}"
-
-
-def _cure_of(text: str) -> str | None:
-    """What to do about a field that is no number; None where it does not show what it is."""
-    if is_number(text.replace(",", ".")):
-        return "write numbers with a decimal point"
-    is_date = re.match(r"\d{4}-\d\d-\d\d|\d\d?:\d\d:", text) is not None
-    return "dates are not read: write seconds or nanoseconds since 1970" if is_date else None
 
 
 def _unit_cure(column: str, unit: str) -> str:

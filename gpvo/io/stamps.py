@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections import deque
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from decimal import Decimal, InvalidOperation
@@ -99,6 +100,23 @@ def likely_unit(text: str) -> str | None:
     except ValueError:
         return None
     return next((unit for limit, unit in _LIMITS if size < limit), None)
+
+
+def is_number(text: str) -> bool:
+    """Whether a field is a number, NaN included."""
+    try:
+        float(text)
+    except ValueError:
+        return False
+    return True
+
+
+def cure_of_number(text: str) -> str | None:
+    """What to do about a field that is no number; None where it does not show what it is."""
+    if "," in text and is_number(text.replace(",", ".")):
+        return "write numbers with a decimal point"
+    is_date = re.match(r"\d{4}-\d\d-\d\d|\d\d?:\d\d:", text) is not None
+    return "dates are not read: write seconds or nanoseconds since 1970" if is_date else None
 
 
 def cure_of_seconds(text: str) -> str | None:

@@ -17,6 +17,7 @@ from gpvo.io.stamps import (
     Stamps,
     astray,
     check_interval,
+    cure_of_number,
     cure_of_seconds,
     cure_of_unit,
     growing,
@@ -166,6 +167,7 @@ def _read_poses(
             stamps.append(stamp(fields[0]))
         except ValueError as error:
             cure = cure_of_seconds(fields[0]) if stamp is seconds_text_to_ns else None
+            cure = cure or cure_of_number(fields[0])
             raise SourceError(f"line {number}: {error}", where=path, cure=cure) from None
         numbers.append(number)
         poses.append(_floats(path, number, fields[1:8]))

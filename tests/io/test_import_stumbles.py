@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
@@ -13,6 +14,7 @@ from gpvo.cli.files import import_log
 from gpvo.errors import CalibrationError, SourceError
 from gpvo.io import open_source
 from gpvo.io.foreign import read_foreign
+from gpvo.io.trajectory import read_tum
 
 POSE = "0,0,0,0,0,0,1"
 
@@ -160,3 +162,11 @@ def test_vins_may_end_lines_with_a_comma(tmp_path: Path) -> None:
     path = tmp_path / "log.csv"
     path.write_text(f"{HEAD}\n0.0,{POSE},\n0.1,{POSE},\n")
     assert len(read_foreign(path).t_ns) == 2
+
+
+@pytest.mark.parametrize("read", [read_foreign, read_tum])
+def test_tum_lines_with_decimal_commas_are_named_as_such(read: Callable[[Path], object], tmp_path: Path) -> None:
+    path = tmp_path / "gt.tum"
+    path.write_text("".join(f"{k},5 0,1 0,2 0,3 0,0 0,0 0,0 1,0\n" for k in range(3)))
+    with pytest.raises(SourceError, match=r"'0,5' is not a number \(write numbers with a decimal point\)"):
+        read(path)
