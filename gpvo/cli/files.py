@@ -192,7 +192,7 @@ def info(
 def import_(
     log: Annotated[Path, "Trajectory, CSV or bag of another odometry; or a run, to give it ground truth."],
     out: Annotated[Path, "Run folder to write."],
-    truth: Annotated[Path | None, "Ground truth: a trajectory, CSV or bag."] = None,
+    truth: Annotated[Path | None, "Ground truth of the same frame, or see --align: a trajectory, CSV or bag."] = None,
     format_: Annotated[str | None, "tum, kitti, csv or bag; guessed by default."] = None,
     truth_format: Annotated[str | None, "The same for the ground truth."] = None,
     map_: Annotated[list[str] | None, "Columns of a CSV, e.g. var_x=cov_00.", {"metavar": "COLUMN=NAME"}] = None,
@@ -252,9 +252,9 @@ def import_(
 
 def _refuse_of_a_run(run: Path, given: dict[str, Any]) -> None:
     """Refuse what says how a file is read: a run knows, and its poses are those of its left camera."""
-    for name in (name for name, value in given.items() if value):
+    if names := [name for name, value in given.items() if value]:
         cure = "leave it out; --align transform fits a truth of another frame"
-        raise SourceError(f"--{name} has no effect on a run", where=run, cure=cure)
+        raise SourceError(f"--{names[0]} has no effect on a run", where=run, cure=cure)
 
 
 def _mapping(option: str, texts: list[str]) -> dict[str, str]:
