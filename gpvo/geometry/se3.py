@@ -307,8 +307,9 @@ for _R in (R_FLU_OPTICAL, R_FRD_FLU, R_NED_ENU, R_FLU_T265):
     _R.setflags(write=False)
 
 
-def rotate_covariance(R_new_old: Array, covariance: Array) -> Array:
-    """(..., 6, 6) covariance (translation, rotation), expressed in rotated axes: ``B C B^T``, B = blockdiag(R, R)."""
+def rotate_covariance(R_new_old: Array, covariance: Array, of_rotation: Array | None = None) -> Array:
+    """(..., 6, 6) covariance (translation, rotation), expressed in rotated axes: ``B C B^T``, B = blockdiag(R, R);
+    with ``of_rotation`` (..., 3, 3) as the latter R, where the rotation's old axes are others."""
     B = np.zeros(covariance.shape)
-    B[..., :3, :3] = B[..., 3:, 3:] = R_new_old
+    B[..., :3, :3], B[..., 3:, 3:] = R_new_old, R_new_old if of_rotation is None else of_rotation
     return B @ covariance @ np.swapaxes(B, -1, -2)

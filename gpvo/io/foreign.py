@@ -25,10 +25,12 @@ from gpvo.stats.consistency import SEEN, seen_axes
 from gpvo.types import COUNT_FIELDS, FLOAT_FIELDS, Array
 
 FORMATS = ("tum", "kitti", "csv", "bag")
+COVARIANCE_AXES = ("auto", "world", "body", "mixed")
 # FLU body at the camera's own place, looking forward.
 T_FLU_OPTICAL: Array = se3.from_rt(R_FLU_OPTICAL, np.zeros(3))
 # What a step adds to a variance, beyond rounding: of the variance, and of the least that is seen.
 _GROWS, _GROWS_SEEN = 1e-6, 1e-3
+MIXED_AXES = "the rotation's covariances are read as in the body's axes, as OpenVINS has them (--covariance-axes)"
 NONE_STATED = "its covariances are not positive definite and were left out"
 
 
@@ -130,7 +132,7 @@ def read_foreign(
     times: str | Path | None = None,
     rate_hz: float | None = None,
     covariance_of: str | None = None,
-    covariance_axes: str = "world",
+    covariance_axes: str = "auto",
     complete: bool = False,
 ) -> ForeignLog:
     """Read another odometry's log, or a ground truth.
@@ -146,7 +148,9 @@ def read_foreign(
     covariance_of : what covariance columns of a CSV are of, ``"pose"`` (default) or ``"motion"``.
     complete : refuse rows of a CSV, or messages of a bag, without a pose, as a ground truth must; else they are left
         out and counted.
-    covariance_axes : ``"world"`` for covariances in the axes of the fixed frame, as ROS has them, or ``"body"``.
+    covariance_axes : of a CSV: ``"world"`` for covariances in the axes of the fixed frame, as ROS has them, ``"body"``,
+        or ``"mixed"`` for the position's in the world's and the rotation's in the body's, as most filters have them;
+        ``"auto"``: mixed where the columns have the names of OpenVINS, else world.
     """
     p = Path(path)
     name = kind or guess_format(p)
@@ -165,8 +169,11 @@ def read_foreign(
 
 
 def _from_table(path: Path, table: Table, covariance_of: str, axes: str, complete: bool) -> ForeignLog:
-    if covariance_of not in ("pose", "motion") or axes not in ("world", "body"):
-        raise SourceError("covariances are of 'pose' or 'motion', in axes of 'world' or 'body'", where=path)
+    if covariance_of not in ("pose", "motion") or axes not in COVARIANCE_AXES:
+        raise SourceError(f"covariances are of pose or motion, in axes {' or '.join(COVARIANCE_AXES)}", where=path)
+    notes = [*table.notes]
+    if axes == "auto" and (axes := table.covariance_axes) == "mixed":
+        notes.append(MIXED_AXES)
     c = table.columns
     pose = np.stack([c[n] for n in ("p_x", "p_y", "p_z", "q_x", "q_y", "q_z", "q_w")], axis=1)
     known: NDArray[np.bool_] = np.asarray(np.isfinite(pose).all(axis=1))
@@ -182,7 +189,7 @@ def _from_table(path: Path, table: Table, covariance_of: str, axes: str, complet
     trajectory = Trajectory(t, se3.from_quaternion(pose[:, :3], pose[:, 3:]))
     cov = _table_covariance(c, known)
     if cov is not None:
-        cov = _into_body(trajectory, cov) if axes == "world" else cov
+        cov = cov if axes == "body" else _into_body(trajectory, cov, axes)
         still = still_axes(trajectory.T_world_body)
         stated = np.array([f"cov_{i}{i}" in c for i in range(6)])
         planar = (stated | still).all() and stated[3:].any()  # of the position alone, it says nothing of the motion
@@ -194,7 +201,7 @@ def _from_table(path: Path, table: Table, covariance_of: str, axes: str, complet
         cov,
         covariance_of,
         {n: c[n][known] for n in (*COUNT_FIELDS, *FLOAT_FIELDS) if n in c},
-        (*table.notes, *((f"{lost} rows without a pose were left out",) if lost else ()), *_unused(table, cov)),
+        (*notes, *((f"{lost} rows without a pose were left out",) if lost else ()), *_unused(table, cov)),
     )
 
 
@@ -221,9 +228,10 @@ def _table_covariance(columns: Mapping[str, Array], known: NDArray[np.bool_]) ->
     return np.where(np.isfinite(C), C, np.nan)
 
 
-def _into_body(trajectory: Trajectory, covariance: Array) -> Array:
-    """Covariances of fixed axes turned into those of the moving frame."""
-    return se3.rotate_covariance(np.swapaxes(trajectory.T_world_body[:, :3, :3], -1, -2), covariance)
+def _into_body(trajectory: Trajectory, covariance: Array, axes: str = "world") -> Array:
+    """Covariances of fixed axes, or of ``mixed`` ones, turned into those of the moving frame."""
+    of_rotation = np.eye(3) if axes == "mixed" else None
+    return se3.rotate_covariance(np.swapaxes(trajectory.T_world_body[:, :3, :3], -1, -2), covariance, of_rotation)
 
 
 def still_axes(T_world_body: Array) -> NDArray[np.bool_]:
