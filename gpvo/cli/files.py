@@ -177,8 +177,8 @@ def import_(
     covariance_of: Annotated[str, "Whether the covariances in a CSV are of poses or motions."] = "pose",
     covariance_axes: Annotated[
         str,
-        "Axes of the covariances in a CSV: world, body, mixed (those of the rotation alone are the body's), or auto: "
-        "mixed for columns of OpenVINS' names, else world.",
+        "Axes of covariances of poses: world, body, mixed (those of the rotation alone are the body's), or auto: mixed "
+        "for columns of OpenVINS' names, else world.",
     ] = "auto",
     vehicle: options.VehicleOptions = options.VehicleOptions(),
     overwrite: options.Overwrite = False,

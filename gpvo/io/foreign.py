@@ -146,16 +146,16 @@ def read_foreign(
     topic : for bags, the topic of poses; by default the only one, an Odometry first.
     times, rate_hz : for KITTI poses, which have no stamps: a file with a line of seconds each, or the rate.
     covariance_of : what covariance columns of a CSV are of, ``"pose"`` (default) or ``"motion"``.
-    complete : refuse rows of a CSV, or messages of a bag, without a pose, as a ground truth must; else they are left
-        out and counted.
-    covariance_axes : of a CSV: ``"world"`` for covariances in the axes of the fixed frame, as ROS has them, ``"body"``,
-        or ``"mixed"`` for the position's in the world's and the rotation's in the body's, as most filters have them;
-        ``"auto"``: mixed where the columns have the names of OpenVINS, else world.
+    complete : refuse rows of a CSV, or messages of a bag, without a pose, as of a ground truth; else they are counted.
+    covariance_axes : of covariances of poses: of the ``"world"``, as in ROS, the ``"body"``, or ``"mixed"``: those of
+        the rotation alone the body's, as in most filters; ``"auto"``: mixed for columns of OpenVINS' names, else world.
     """
     p = Path(path)
     name = kind or guess_format(p)
     if name not in FORMATS:
         raise SourceError(f"unknown format '{name}'", cure=f"choose one of {', '.join(FORMATS)}")
+    if covariance_of not in (None, "pose", "motion") or covariance_axes not in COVARIANCE_AXES:
+        raise SourceError(f"covariances are of pose or motion, in axes {' or '.join(COVARIANCE_AXES)}", where=p)
     if not p.exists():
         raise SourceError("no such file", where=p)
     if name == "tum":
@@ -165,12 +165,10 @@ def read_foreign(
         return ForeignLog(p, trajectory, is_counted=is_counted)
     if name == "csv":
         return _from_table(p, read_table(p, mapping or {}), covariance_of or "pose", covariance_axes, complete)
-    return _read_bag(p, topic, complete)
+    return _read_bag(p, topic, covariance_axes, complete)
 
 
 def _from_table(path: Path, table: Table, covariance_of: str, axes: str, complete: bool) -> ForeignLog:
-    if covariance_of not in ("pose", "motion") or axes not in COVARIANCE_AXES:
-        raise SourceError(f"covariances are of pose or motion, in axes {' or '.join(COVARIANCE_AXES)}", where=path)
     notes = [*table.notes]
     if axes == "auto" and (axes := table.covariance_axes) == "mixed":
         notes.append(MIXED_AXES)
@@ -189,7 +187,7 @@ def _from_table(path: Path, table: Table, covariance_of: str, axes: str, complet
     trajectory = Trajectory(t, se3.from_quaternion(pose[:, :3], pose[:, 3:]))
     cov = _table_covariance(c, known)
     if cov is not None:
-        cov = cov if axes == "body" else _into_body(trajectory, cov, axes)
+        cov = _into_body(trajectory, cov, axes)
         still = still_axes(trajectory.T_world_body)
         stated = np.array([f"cov_{i}{i}" in c for i in range(6)])
         planar = (stated | still).all() and stated[3:].any()  # of the position alone, it says nothing of the motion
@@ -228,8 +226,10 @@ def _table_covariance(columns: Mapping[str, Array], known: NDArray[np.bool_]) ->
     return np.where(np.isfinite(C), C, np.nan)
 
 
-def _into_body(trajectory: Trajectory, covariance: Array, axes: str = "world") -> Array:
-    """Covariances of fixed axes, or of ``mixed`` ones, turned into those of the moving frame."""
+def _into_body(trajectory: Trajectory, covariance: Array, axes: str) -> Array:
+    """Covariances of fixed axes, unless ``axes`` says otherwise, turned into those of the moving frame."""
+    if axes == "body":
+        return covariance
     of_rotation = np.eye(3) if axes == "mixed" else None
     return se3.rotate_covariance(np.swapaxes(trajectory.T_world_body[:, :3, :3], -1, -2), covariance, of_rotation)
 
@@ -289,7 +289,7 @@ def _read_kitti(path: Path, times: str | Path | None, rate_hz: float | None) -> 
     return Trajectory(t, T), times is None
 
 
-def _read_bag(path: Path, topic: str | None, complete: bool) -> ForeignLog:
+def _read_bag(path: Path, topic: str | None, axes: str, complete: bool) -> ForeignLog:
     with open_bag(path) as reader:
         odometry, poses = (list(topics_of(reader, kinds)) for kinds in ((ODOMETRY_TYPE,), POSE_TYPES))
     if topic is None:
@@ -298,17 +298,17 @@ def _read_bag(path: Path, topic: str | None, complete: bool) -> ForeignLog:
             found = ", ".join(wanted) or "none"
             raise SourceError(f"which topic? (poses on: {found})", where=path, cure="name one with --topic")
         topic = wanted[0]
-    return replace(_read_bag_topic(path, topic, complete), other_topics=tuple(t for t in poses if t != topic))
+    return replace(_read_bag_topic(path, topic, axes, complete), other_topics=tuple(t for t in poses if t != topic))
 
 
-def _read_bag_topic(path: Path, topic: str, complete: bool) -> ForeignLog:
+def _read_bag_topic(path: Path, topic: str, axes: str, complete: bool) -> ForeignLog:
     notes: list[str] = []
     t, T, read = read_poses(path, topic, notes.append, complete=complete)
     log = ForeignLog(path, Trajectory(t, T), notes=tuple(notes), topic=topic, frame_id=moving_frame(read[0]))
     stated = (covariances_of(read, name) for name in ("twist", "pose"))
     twist, pose = (None if C is None else np.where(np.isfinite(C), C, np.nan) for C in stated)
     still = still_axes(T)
-    pose = None if pose is None else definite_in_plane(_into_body(log.trajectory, pose), still)
+    pose = None if pose is None else definite_in_plane(_into_body(log.trajectory, pose, axes), still)
     twist = None if twist is None else definite_in_plane(twist, still)
     if twist is not None and _looks_stated(twist):
         # Of the velocity in the child frame over the step that ends at the stamp.
