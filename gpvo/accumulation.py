@@ -56,6 +56,19 @@ def independent_part(error: MotionError) -> Array:
     return error.white + error.jitter if error.lost else error.white
 
 
+def between_ends(T_last_cur: Array, last: MotionError, error: MotionError, dt_s: float) -> Array:
+    """Covariance (6, 6) of the motion ``T_last_cur`` between the ends, ``dt_s`` apart, of motions from one reference.
+
+    The reference's noise is in neither; of what persists there remains the difference, as of a scale that is wrong.
+    """
+    both, moved = stacked([last, error]), carry(T_last_cur)
+    own = frame_jitter(both.jitter) + both.white
+    kept = persistence(dt_s, both.persistent_tau_s)
+    before, now = both.persistent_root
+    changed, new = now * kept - moved @ before, now * np.sqrt(1.0 - kept**2)
+    return np.asarray(own[1] + moved @ own[0] @ moved.T + changed @ changed.T + new @ new.T)
+
+
 def persistence(dt_s: ArrayLike, tau_s: Array) -> Array:
     """(..., P) correlation ``exp(-dt / tau)`` of the persistent vector over ``dt_s`` (...)."""
     return np.asarray(np.exp(-np.maximum(dt_s, 0.0)[..., None] / np.maximum(tau_s, 1e-9)))

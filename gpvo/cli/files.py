@@ -19,7 +19,7 @@ from gpvo.dataset.errors import interpolate_truth
 from gpvo.dataset.hand_eye import FixedTransform, align_frames
 from gpvo.errors import GpvoError, SourceError
 from gpvo.files import plain
-from gpvo.io.foreign import T_FLU_OPTICAL, ForeignLog, check_same_rows, read_foreign
+from gpvo.io.foreign import COVARIANCE_AXES, T_FLU_OPTICAL, ForeignLog, check_same_rows, read_foreign
 from gpvo.io.foreign_csv import NO_HEADER
 from gpvo.io.run import Run, copy_run, read_run, write_run
 from gpvo.io.run_read import is_run
@@ -216,7 +216,11 @@ def import_(
     time_offset: Annotated[str, "Seconds to add to the stamps of the log, or auto."] = "0",
     truth_sigma: Annotated[str | None, "White noise of the truth per pose, METRES,RADIANS."] = None,
     covariance_of: Annotated[str, "Whether the covariances in a CSV are of poses or motions."] = "pose",
-    covariance_axes: Annotated[str, "Axes of the covariances in a CSV: world or body."] = "world",
+    covariance_axes: Annotated[
+        str,
+        "Axes of covariances of poses: world, body, mixed (those of the rotation alone are the body's), or auto: mixed "
+        "for columns of OpenVINS' names, else world.",
+    ] = "auto",
     vehicle: options.VehicleOptions = options.VehicleOptions(),
     overwrite: options.Overwrite = False,
     json_: Json = False,
@@ -231,7 +235,7 @@ def import_(
         translation, rotation = numbers("--truth-sigma", truth_sigma, cure, counts=(2,), least=0.0)
         sigma = (translation, rotation)
     one_of("--covariance-of", covariance_of, ("pose", "motion"))
-    one_of("--covariance-axes", covariance_axes, ("world", "body"))
+    one_of("--covariance-axes", covariance_axes, COVARIANCE_AXES)
     one_of("--frame", frame, ("auto", "cam", "body"))
     one_of("--align", align, ("none", "rotation", "transform"))
     mapping, truth_mapping = _mapping("--map", map_ or []), _mapping("--truth-map", truth_map or [])

@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 
 from gpvo.errors import GpvoError
 from gpvo.geometry import se3
+from gpvo.stats.consistency import rms
 from gpvo.stats.series import block_bootstrap, integral, interpolated, moving_sums
 from gpvo.types import Array, TruthLog, VoLog, VoRecord
 
@@ -34,8 +35,6 @@ _SAME = 3e-4
 that close loops leave 1e-5 (on the road, with four decimals, 1e-4); cameras and truths of their own over 5e-3."""
 _MIN_WINDOWS = 10
 _NO_TURN_DEG, _TURN_DEG, _STRAIGHT = 1e-3, 5.0, 0.05  # the last: of a path's extent, what it has across
-
-
 _LEAPS, _MOVING = 1.5, 0.25
 
 
@@ -126,10 +125,10 @@ def interpolated_between(truth: TruthLog) -> int | None:
 
 
 def interpolation_sigma(truth: TruthLog, t_ns: NDArray[np.int64]) -> Array:
-    """(6,) standard deviation [m, rad] of interpolated poses of a truth slower than the frames at ``t_ns``; else 0.
+    """(6,) standard deviation [m, rad] of poses interpolated at ``t_ns``, if frames come faster than truth; else 0.
 
-    Half of the truth's own poses tell what interpolation misses at twice the step; as for any path smooth at that
-    scale, it misses a quarter of it at the step itself.
+    Half of the truth's own poses tell what interpolation misses midway at twice the step; as for any path smooth at
+    that scale, it misses a quarter of it at the step itself, and ``4 f (1 - f)`` of that at the share f of a step.
     """
     truth = without_held(truth)
     if len(truth.t_ns) < 9 or steps_of_slow_truth(truth, t_ns) is None:
@@ -137,7 +136,9 @@ def interpolation_sigma(truth: TruthLog, t_ns: NDArray[np.int64]) -> Array:
     half = TruthLog(truth.t_ns[::2], truth.T_world_cam[::2])
     T, known = interpolate_truth(half, truth.t_ns[1::2], 2.0 * MAX_GAP_S)
     missed = se3.log(se3.inverse(T) @ truth.T_world_cam[1::2])[known]
-    return np.sqrt((missed**2).mean(axis=0)) / 4.0 if len(missed) else np.zeros(6)
+    inside = (t_ns - truth.t_ns[0])[(t_ns >= truth.t_ns[0]) & (t_ns <= truth.t_ns[-1])]
+    share = np.interp(inside, truth.t_ns - truth.t_ns[0], np.arange(len(truth.t_ns))) % 1.0
+    return rms(missed) * rms(share * (1.0 - share)) if len(missed) and len(inside) else np.zeros(6)
 
 
 @dataclass(frozen=True)
@@ -205,8 +206,7 @@ def require_attitude(log: VoLog, truth: TruthLog, where: object) -> None:
 
 def _turn_deg(T: Array) -> float:
     """Largest rotation between the first of poses (N, 4, 4) and another."""
-    R = np.swapaxes(T[:1, :3, :3], 1, 2) @ T[:, :3, :3]
-    return float(np.rad2deg(np.linalg.norm(se3.so3_log(R), axis=1).max()))
+    return float(np.rad2deg(sizes(se3.inverse(T[:1]) @ T)[1].max()))
 
 
 def motion_targets(records: Sequence[VoRecord], truth: TruthLog) -> tuple[Array, NDArray[np.bool_]]:

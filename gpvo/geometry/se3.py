@@ -19,6 +19,7 @@ from gpvo.types import Array
 # Below this angle the closed forms lose more digits to cancellation than the series drop.
 _SMALL_ANGLE_RAD = 1e-4
 _NOT_RIGID = 1e-3
+_SIGNS = 2.0 * np.eye(4, 3) - [[1.0], [1.0], [1.0], [-1.0]]  # of a rotation's diagonal in each squared component
 
 
 def skew(v: Array) -> Array:
@@ -132,12 +133,8 @@ def so3_left_jacobian_inverse(phi: Array) -> Array:
 def exp(xi: Array) -> Array:
     """Tangent (..., 6) to pose (..., 4, 4)."""
     xi = np.asarray(xi, dtype=np.float64)
-    T = np.zeros((*xi.shape[:-1], 4, 4))
     (a, b, c, W, WW), eye = _powers(xi[..., 3:]), np.eye(3)
-    T[..., :3, :3] = eye + a * W + b * WW
-    T[..., :3, 3] = ((eye + b * W + c * WW) @ xi[..., :3, None])[..., 0]
-    T[..., 3, 3] = 1.0
-    return T
+    return from_rt(eye + a * W + b * WW, ((eye + b * W + c * WW) @ xi[..., :3, None])[..., 0])
 
 
 def log(T: Array) -> Array:
@@ -188,12 +185,8 @@ def _long_quaternion(*rows: tuple[float, float, float]) -> tuple[float, float, f
 def inverse(T: Array) -> Array:
     """Inverse pose, by transposing the rotation. (..., 4, 4) -> (..., 4, 4)."""
     T = np.asarray(T, dtype=np.float64)
-    out = np.zeros_like(T)
     Rt = np.swapaxes(T[..., :3, :3], -1, -2)
-    out[..., :3, :3] = Rt
-    out[..., :3, 3] = -(Rt @ T[..., :3, 3, None])[..., 0]
-    out[..., 3, 3] = 1.0
-    return out
+    return from_rt(Rt, -(Rt @ T[..., :3, 3, None])[..., 0])
 
 
 def adjoint(T: Array) -> Array:
@@ -227,14 +220,12 @@ def from_quaternion(t: Array, q_xyzw: Array) -> Array:
     """
     q = np.asarray(q_xyzw, dtype=np.float64)
     x, y, z, w = np.moveaxis(q / np.linalg.norm(q, axis=-1, keepdims=True), -1, 0)
-    R = np.stack(
-        [
-            np.stack([1 - 2 * (y * y + z * z), 2 * (x * y - z * w), 2 * (x * z + y * w)], -1),
-            np.stack([2 * (x * y + z * w), 1 - 2 * (x * x + z * z), 2 * (y * z - x * w)], -1),
-            np.stack([2 * (x * z - y * w), 2 * (y * z + x * w), 1 - 2 * (x * x + y * y)], -1),
-        ],
-        -2,
+    rows = (
+        (1 - 2 * (y * y + z * z), 2 * (x * y - z * w), 2 * (x * z + y * w)),
+        (2 * (x * y + z * w), 1 - 2 * (x * x + z * z), 2 * (y * z - x * w)),
+        (2 * (x * z - y * w), 2 * (y * z + x * w), 1 - 2 * (x * x + y * y)),
     )
+    R = np.stack([np.stack(row, -1) for row in rows], -2)
     return from_rt(R, t)
 
 
@@ -247,20 +238,14 @@ def rotation_to_quaternion_xyzw(R: Array) -> Array:
     if R.ndim == 2:
         q = np.array(_long_quaternion(*R.tolist()))
         return q / math.copysign(np.linalg.norm(q), q[3] if q[3] else 1.0)
-    d0, d1, d2 = R[..., 0, 0], R[..., 1, 1], R[..., 2, 2]
-    choice = np.argmax(np.stack([d0, d1, d2, d0 + d1 + d2], -1), axis=-1)
-    yz, zx, xy = (R[..., i, j] + R[..., j, i] for i, j in ((1, 2), (2, 0), (0, 1)))
-    wx, wy, wz = (R[..., i, j] - R[..., j, i] for i, j in ((2, 1), (0, 2), (1, 0)))
-    candidates = np.stack(
-        [
-            np.stack([1 + d0 - d1 - d2, xy, zx, wx], -1),
-            np.stack([xy, 1 - d0 + d1 - d2, yz, wy], -1),
-            np.stack([zx, yz, 1 - d0 - d1 + d2, wz], -1),
-            np.stack([wx, wy, wz, 1 + d0 + d1 + d2], -1),
-        ],
-        -2,
-    )
-    q = np.take_along_axis(candidates, choice[..., None, None], axis=-2)[..., 0, :]
+    d = np.diagonal(R, axis1=-2, axis2=-1)
+    choice = np.argmax(np.concatenate([d, (d[..., :1] + d[..., 1:2] + d[..., 2:])], -1), axis=-1)
+    multiples = np.empty((*d.shape[:-1], 4, 4))  # 4 q q^T: each row is one of q
+    multiples[..., :3, :3] = R + np.swapaxes(R, -1, -2)
+    multiples[..., :3, 3] = multiples[..., 3, :3] = R[..., [2, 0, 1], [1, 2, 0]] - R[..., [1, 2, 0], [2, 0, 1]]
+    signed = d[..., None, :] * _SIGNS
+    multiples[..., range(4), range(4)] = 1 + signed[..., 0] + signed[..., 1] + signed[..., 2]
+    q = np.take_along_axis(multiples, choice[..., None, None], axis=-2)[..., 0, :]
     q = q / np.linalg.norm(q, axis=-1, keepdims=True)
     return np.where(q[..., 3:] < 0, -q, q)
 
@@ -322,8 +307,9 @@ for _R in (R_FLU_OPTICAL, R_FRD_FLU, R_NED_ENU, R_FLU_T265):
     _R.setflags(write=False)
 
 
-def rotate_covariance(R_new_old: Array, covariance: Array) -> Array:
-    """(..., 6, 6) covariance (translation, rotation), expressed in rotated axes: ``B C B^T``, B = blockdiag(R, R)."""
+def rotate_covariance(R_new_old: Array, covariance: Array, of_rotation: Array | None = None) -> Array:
+    """(..., 6, 6) covariance (translation, rotation), expressed in rotated axes: ``B C B^T``, B = blockdiag(R, R);
+    with ``of_rotation`` (..., 3, 3) as the latter R, where the rotation's old axes are others."""
     B = np.zeros(covariance.shape)
-    B[..., :3, :3] = B[..., 3:, 3:] = R_new_old
+    B[..., :3, :3], B[..., 3:, 3:] = R_new_old, R_new_old if of_rotation is None else of_rotation
     return B @ covariance @ np.swapaxes(B, -1, -2)

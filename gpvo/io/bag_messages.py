@@ -23,12 +23,7 @@ from gpvo.stats.series import interpolated
 from gpvo.types import Array, ImuLog
 
 # OpenCV names the pattern by its second row and column.
-_BAYER = {
-    "bayer_rggb": "BG",
-    "bayer_bggr": "RG",
-    "bayer_gbrg": "GR",
-    "bayer_grbg": "GB",
-}
+_BAYER = {"bayer_rggb": "BG", "bayer_bggr": "RG", "bayer_gbrg": "GR", "bayer_grbg": "GB"}
 _CHANNELS = {"mono": (1, True), "rgb": (3, False), "bgr": (3, True), "rgba": (4, False), "bgra": (4, True)}
 _CHANNELS |= dict.fromkeys(_BAYER, (1, True))
 # Names of sensor_msgs/image_encodings.hpp: (type, channels, blue first)

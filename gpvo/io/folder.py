@@ -54,13 +54,9 @@ class FolderSource(FileSource):
         rig = read_stereo_yaml(chain, size=None if first is None else first[1])
         super().__init__(path, path.resolve().name, rig, pairs, known, **options)
         if (path / "imu.csv").is_file():
-            noise = path / "imu.yaml"
-            self.imu = read_imu_csv(
-                path / "imu.csv",
-                shift_s=rig.timeshift_cam_imu_s,
-                noise=read_imu_noise(noise) if noise.is_file() else None,
-                remark=self.remark,
-            )
+            noise = read_imu_noise(stated) if (stated := path / "imu.yaml").is_file() else None
+            shift_s = rig.timeshift_cam_imu_s
+            self.imu = read_imu_csv(path / "imu.csv", shift_s=shift_s, noise=noise, remark=self.remark)
         if (path / "truth.tum").is_file():
             self.truth = carry(read_tum(path / "truth.tum"), self.rectifier.T_left_cam, UNKNOWN)
             check_overlap(self.truth, self.span_ns, path / "truth.tum")

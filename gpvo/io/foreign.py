@@ -25,11 +25,13 @@ from gpvo.stats.consistency import SEEN, seen_axes
 from gpvo.types import COUNT_FIELDS, FLOAT_FIELDS, Array
 
 FORMATS = ("tum", "kitti", "csv", "bag")
+COVARIANCE_AXES = ("auto", "world", "body", "mixed")
 # FLU body at the camera's own place, looking forward.
 T_FLU_OPTICAL: Array = se3.from_rt(R_FLU_OPTICAL, np.zeros(3))
 # What a step adds to a variance, beyond rounding: of the variance, and of the least that is seen.
 _GROWS, _GROWS_SEEN = 1e-6, 1e-3
 _NAMED = 12  # columns in a remark
+MIXED_AXES = "the rotation's covariances are read as in the body's axes, as OpenVINS has them (--covariance-axes)"
 NONE_STATED = "its covariances are not positive definite and were left out"
 
 
@@ -131,7 +133,7 @@ def read_foreign(
     times: str | Path | None = None,
     rate_hz: float | None = None,
     covariance_of: str | None = None,
-    covariance_axes: str = "world",
+    covariance_axes: str = "auto",
     complete: bool = False,
 ) -> ForeignLog:
     """Read another odometry's log, or a ground truth.
@@ -145,14 +147,16 @@ def read_foreign(
     topic : for bags, the topic of poses; by default the only one, an Odometry first.
     times, rate_hz : for KITTI poses, which have no stamps: a file with a line of seconds each, or the rate.
     covariance_of : what covariance columns of a CSV are of, ``"pose"`` (default) or ``"motion"``.
-    complete : refuse rows of a CSV, or messages of a bag, without a pose, as a ground truth must; else they are left
-        out and counted.
-    covariance_axes : ``"world"`` for covariances in the axes of the fixed frame, as ROS has them, or ``"body"``.
+    complete : refuse rows of a CSV, or messages of a bag, without a pose, as of a ground truth; else they are counted.
+    covariance_axes : of covariances of poses: of the ``"world"``, as in ROS, the ``"body"``, or ``"mixed"``: those of
+        the rotation alone the body's, as in most filters; ``"auto"``: mixed for columns of OpenVINS' names, else world.
     """
     p = Path(path)
     name = kind or guess_format(p)
     if name not in FORMATS:
         raise SourceError(f"unknown format '{name}'", cure=f"choose one of {', '.join(FORMATS)}")
+    if covariance_of not in (None, "pose", "motion") or covariance_axes not in COVARIANCE_AXES:
+        raise SourceError(f"covariances are of pose or motion, in axes {' or '.join(COVARIANCE_AXES)}", where=p)
     if not p.exists():
         raise SourceError("no such file", where=p)
     if name == "tum":
@@ -162,12 +166,13 @@ def read_foreign(
         return ForeignLog(p, trajectory, is_counted=is_counted)
     if name == "csv":
         return _from_table(p, read_table(p, mapping or {}), covariance_of or "pose", covariance_axes, complete)
-    return _read_bag(p, topic, complete)
+    return _read_bag(p, topic, covariance_axes, complete)
 
 
 def _from_table(path: Path, table: Table, covariance_of: str, axes: str, complete: bool) -> ForeignLog:
-    if covariance_of not in ("pose", "motion") or axes not in ("world", "body"):
-        raise SourceError("covariances are of 'pose' or 'motion', in axes of 'world' or 'body'", where=path)
+    notes = [*table.notes]
+    if axes == "auto" and (axes := table.covariance_axes) == "mixed":
+        notes.append(MIXED_AXES)
     c = table.columns
     pose = np.stack([c[n] for n in ("p_x", "p_y", "p_z", "q_x", "q_y", "q_z", "q_w")], axis=1)
     known: NDArray[np.bool_] = np.asarray(np.isfinite(pose).all(axis=1))
@@ -183,7 +188,7 @@ def _from_table(path: Path, table: Table, covariance_of: str, axes: str, complet
     trajectory = Trajectory(t, se3.from_quaternion(pose[:, :3], pose[:, 3:]))
     cov = _table_covariance(c, known)
     if cov is not None:
-        cov = _into_body(trajectory, cov) if axes == "world" else cov
+        cov = _into_body(trajectory, cov, axes)
         still = still_axes(trajectory.T_world_body)
         stated = np.array([f"cov_{i}{i}" in c for i in range(6)])
         planar = (stated | still).all() and stated[3:].any()  # of the position alone, it says nothing of the motion
@@ -195,7 +200,7 @@ def _from_table(path: Path, table: Table, covariance_of: str, axes: str, complet
         cov,
         covariance_of,
         {n: c[n][known] for n in (*COUNT_FIELDS, *FLOAT_FIELDS) if n in c},
-        (*table.notes, *((f"{lost} rows without a pose were left out",) if lost else ()), *_unused(table, cov)),
+        (*notes, *((f"{lost} rows without a pose were left out",) if lost else ()), *_unused(table, cov)),
     )
 
 
@@ -224,9 +229,12 @@ def _table_covariance(columns: Mapping[str, Array], known: NDArray[np.bool_]) ->
     return np.where(np.isfinite(C), C, np.nan)
 
 
-def _into_body(trajectory: Trajectory, covariance: Array) -> Array:
-    """Covariances of fixed axes turned into those of the moving frame."""
-    return se3.rotate_covariance(np.swapaxes(trajectory.T_world_body[:, :3, :3], -1, -2), covariance)
+def _into_body(trajectory: Trajectory, covariance: Array, axes: str) -> Array:
+    """Covariances of fixed axes, unless ``axes`` says otherwise, turned into those of the moving frame."""
+    if axes == "body":
+        return covariance
+    of_rotation = np.eye(3) if axes == "mixed" else None
+    return se3.rotate_covariance(np.swapaxes(trajectory.T_world_body[:, :3, :3], -1, -2), covariance, of_rotation)
 
 
 def still_axes(T_world_body: Array) -> NDArray[np.bool_]:
@@ -284,7 +292,7 @@ def _read_kitti(path: Path, times: str | Path | None, rate_hz: float | None) -> 
     return Trajectory(t, T), times is None
 
 
-def _read_bag(path: Path, topic: str | None, complete: bool) -> ForeignLog:
+def _read_bag(path: Path, topic: str | None, axes: str, complete: bool) -> ForeignLog:
     with open_bag(path) as reader:
         odometry, poses = (list(topics_of(reader, kinds)) for kinds in ((ODOMETRY_TYPE,), POSE_TYPES))
     if topic is None:
@@ -293,17 +301,17 @@ def _read_bag(path: Path, topic: str | None, complete: bool) -> ForeignLog:
             found = ", ".join(wanted) or "none"
             raise SourceError(f"which topic? (poses on: {found})", where=path, cure="name one with --topic")
         topic = wanted[0]
-    return replace(_read_bag_topic(path, topic, complete), other_topics=tuple(t for t in poses if t != topic))
+    return replace(_read_bag_topic(path, topic, axes, complete), other_topics=tuple(t for t in poses if t != topic))
 
 
-def _read_bag_topic(path: Path, topic: str, complete: bool) -> ForeignLog:
+def _read_bag_topic(path: Path, topic: str, axes: str, complete: bool) -> ForeignLog:
     notes: list[str] = []
     t, T, read = read_poses(path, topic, notes.append, complete=complete)
     log = ForeignLog(path, Trajectory(t, T), notes=tuple(notes), topic=topic, frame_id=moving_frame(read[0]))
     stated = (covariances_of(read, name) for name in ("twist", "pose"))
     twist, pose = (None if C is None else np.where(np.isfinite(C), C, np.nan) for C in stated)
     still = still_axes(T)
-    pose = None if pose is None else definite_in_plane(_into_body(log.trajectory, pose), still)
+    pose = None if pose is None else definite_in_plane(_into_body(log.trajectory, pose, axes), still)
     twist = None if twist is None else definite_in_plane(twist, still)
     if twist is not None and _looks_stated(twist):
         # Of the velocity in the child frame over the step that ends at the stamp.

@@ -34,7 +34,8 @@ _STAMP_NAMES = {
     *("t", "time", "timestamp", "stamp", "sec", "secs"),
     *(f"{name}_{unit}" for name in ("time", "timestamp", "stamp") for unit in (*UNITS_NS, "sec", "secs")),
 }
-# Its own files number the axes, and put the covariance of the rotation (Pr) before that of the translation (Pt).
+# Its own files number the axes, and put the covariance of the rotation (Pr) before that of the translation (Pt); the
+# rotation's is in the axes of the body (ov_eval/src/calc/ResultTrajectory.cpp, ``calculate_error``).
 _OPENVINS = {
     **{f"pt{i + 1}{j + 1}": f"cov_{i}{j}" for i in range(3) for j in range(i, 3)},
     **{f"pr{i + 1}{j + 1}": f"cov_{i + 3}{j + 3}" for i in range(3) for j in range(i, 3)},
@@ -56,27 +57,26 @@ _ANGLES = (
 )
 _MAX_ROWS = 20_000_000
 _EMPTY = {"", "na", "n/a", "none", "null"}  # how an unknown number is written, beside NaN
-_AXES = {
-    name: i % 6
-    for i, name in enumerate(
-        ["x", "y", "z", "roll", "pitch", "yaw", "px", "py", "pz", "rx", "ry", "rz", "tx", "ty", "tz", "r", "p", "yaw"]
-    )
-}
+_AXES = {f"{of}{axis}": i + 3 * (of == "r") for of in ("", "p", "t", "r") for i, axis in enumerate("xyz")}
+_AXES |= {"roll": 3, "pitch": 4, "yaw": 5, "r": 3, "p": 4}
 _AXIS = "roll|pitch|yaw|[prt]?[xyz]|r|p"
 _COVARIANCE = re.compile(rf"(?:pose_|position_)?(?:cov|covariance)_({_AXIS})_?({_AXIS})")
+_POSED = re.compile(r"(?:.*_)?(p|t|pos|position|translation|q|quat|ori|orientation|rotation)(?:_rs_r|_rs)?_?([xyzw])")
 _VARIANCE = re.compile(rf"(?:pose_|position_)?(?:var|variance)_({_AXIS})")
 _UNCERTAIN = re.compile(r"cov|var|sigma|std", re.IGNORECASE)
 
 
 @dataclass(frozen=True)
 class Table:
-    """Columns of a CSV by target name; ``t_ns`` (N,) int64, the others (N,) float64; ``lines`` (N,) for messages."""
+    """Columns of a CSV by target name; ``t_ns`` (N,) int64, the others (N,) float64; ``lines`` (N,) for messages;
+    ``covariance_axes``, of :data:`gpvo.io.foreign.COVARIANCE_AXES`, as the names tell them."""
 
     t_ns: NDArray[np.int64]
     columns: dict[str, Array]
     lines: list[int]
     unused: tuple[str, ...] = ()  # columns that look like an uncertainty and were not understood
     notes: tuple[str, ...] = ()
+    covariance_axes: str = "world"
 
 
 def read_table(path: Path, mapping: Mapping[str, str]) -> Table:
@@ -129,7 +129,8 @@ def read_table(path: Path, mapping: Mapping[str, str]) -> Table:
     data = np.array(rows, dtype=np.float64)
     unused = tuple(c for k, c in enumerate(header) if k not in targets.values() and _UNCERTAIN.search(c))
     columns = {n: data[:, i] for i, n in enumerate(order)}
-    return Table(np.array(stamps, dtype=np.int64), columns, numbers, unused, () if top else (NO_HEADER,))
+    axes = "mixed" if "cov_33" in targets and _plain(header[targets["cov_33"]]) in _OPENVINS else "world"
+    return Table(np.array(stamps, dtype=np.int64), columns, numbers, unused, () if top else (NO_HEADER,), axes)
 
 
 def _lines(path: Path) -> Iterator[tuple[int, list[str]]]:
@@ -260,11 +261,7 @@ def _suggest(column: str) -> str | None:
     if covariance := re.fullmatch(r"(?:(?:.*_)?pose_covariance_?(?:at_)?|cov(?:ariance)?_at_)(\d+)_?", _plain(flat)):
         k = int(covariance[1])
         return f"cov_{k // 6}{k % 6}" if k < 36 else None
-    pose = re.fullmatch(
-        r"(?:.*_)?(p|t|pos|position|translation|q|quat|ori|orientation|rotation)(?:_rs_r|_rs)?_?([xyzw])", name
-    )
-    if pose is None:
-        pose = re.fullmatch(r"()([xyz])", name)
+    pose = _POSED.fullmatch(name) or re.fullmatch(r"()([xyz])", name)
     if pose is None or any(word in name for word in ("twist", "vel", "acc", "cov")):
         return None
     is_quaternion = pose[1][:1] in ("q", "o", "r")

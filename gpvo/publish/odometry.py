@@ -7,7 +7,7 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from gpvo.accumulation import PoseError, frame_jitter
+from gpvo.accumulation import PoseError, between_ends, carry
 from gpvo.errors import GpvoError
 from gpvo.geometry import se3
 from gpvo.geometry.covariance import is_positive_definite, lost_covariance, symmetrise
@@ -95,7 +95,7 @@ class OdometryBuilder:
         self.place(forward if self.T_body_cam is None else np.asarray(self.T_body_cam, dtype=np.float64))
         self._T_odom_cam = self.T_odom_body @ self._T_body_cam
         self._chain: dict[int, _Chain] = {}
-        self._last: tuple[_Chain, Array] | None = None  # the last good frame and its noise
+        self._last: tuple[_Chain, MotionError] | None = None  # the last good frame and what was stated of its motion
         self._speed: Array | None = None
 
     def place(self, T_body_cam: Array) -> None:
@@ -119,7 +119,7 @@ class OdometryBuilder:
         chain = base.extended(record, error)
         twist, twist_covariance = self._twist(record, error, chain)
         self._remember(record, chain)
-        self._last = (chain, frame_jitter(error.jitter) + error.white)
+        self._last = (chain, error)
         return self._message(record, prediction, chain, twist, twist_covariance)
 
     def _error(self, record: VoRecord, prediction: Prediction | None) -> MotionError:
@@ -142,7 +142,8 @@ class OdometryBuilder:
         """Body twist since the last good frame, and its covariance.
 
         Usually that frame is the reference. Where it is not (the vehicle stood still, or a keyframe is kept), the
-        motion is the difference of two motions from one reference, whose noise cancels; both frames' noise remains.
+        motion is the difference of two motions from one reference, whose noise cancels, as does what persists in both;
+        both frames' noise remains.
         """
         t_last = record.t_prev_ns if self._last is None else self._last[0].t_ns
         dt = (record.t_ns - t_last) * 1e-9
@@ -151,11 +152,10 @@ class OdometryBuilder:
         if self._last is None or t_last == record.t_prev_ns:
             xi, covariance = se3.log(record.T_prev_cur), about_zero(error.covariance, error.mean)
         else:
-            last, noise_last = self._last
+            last, stated = self._last
             T_rel = se3.inverse(last.T_first_cam) @ chain.T_first_cam
-            A = se3.adjoint(se3.inverse(T_rel))
-            xi, covariance = se3.log(T_rel), error.covariance - frame_jitter(error.jitter) + A @ noise_last @ A.T
-            covariance = about_zero(covariance, chain.error.mean - A @ last.error.mean)
+            mean = chain.error.mean - carry(T_rel) @ last.error.mean
+            xi, covariance = se3.log(T_rel), about_zero(between_ends(T_rel, stated, error, dt), mean)
         self._speed = xi / dt
         twist = self._Ad @ xi / dt
         J = self._Ad @ se3.right_jacobian_inverse(xi)

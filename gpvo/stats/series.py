@@ -161,8 +161,8 @@ def _memory(values: Array) -> float:
     return max(time, 1.0)
 
 
-_REACHED_BY = 5
-"""Sequences whose draws reach the expanded percentiles."""
+_REACHED_BY = 7
+"""Sequences whose draws reach well beyond the expanded percentiles."""
 
 
 def sequence_bootstrap(values: Array, *, draws: int = 10000, seed: int = 0) -> Interval:
@@ -179,8 +179,8 @@ def bootstrap_over(
 ) -> Interval:
     """The same for any ``statistic`` (draws,) of n sequences, given the indices (draws, n) of those that were drawn.
 
-    The percentiles that three or four sequences call for lie beyond the most extreme draw, which they reach too often:
-    their interval is that of Student's t, by the draws' standard deviation.
+    The percentiles that up to six sequences call for lie beyond the most extreme draw or near it, which they reach too
+    often: their interval is that of Student's t, by the draws' standard deviation.
     """
     value = float(statistic(np.arange(n)[None])[0]) if n else np.nan
     if n < 3:

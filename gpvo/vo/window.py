@@ -108,8 +108,11 @@ class _Reduced:
         return cls(information, gradient, C_inverse, E, b)
 
     def solve(self) -> tuple[Array, Array]:
-        """Steps (V, 6) of the poses and (N, k) of the points."""
-        s = 1.0 / np.sqrt(np.diagonal(self.information))
+        """Steps (V, 6) of the poses and (N, k) of the points; LinAlgError where a pose has lost all its points."""
+        diagonal = np.diagonal(self.information)
+        if not (diagonal > 0.0).all():
+            raise np.linalg.LinAlgError("a pose without points")
+        s = 1.0 / np.sqrt(diagonal)
         step = s * np.linalg.solve(self.information * s[:, None] * s, s * self.gradient)
         back = (self.C_inverse @ (self.b - self.E @ step)[:, :, None])[:, :, 0]
         return step.reshape(-1, 6), back

@@ -323,6 +323,23 @@ def test_slow_poses_logged_at_a_higher_rate_are_the_slow_truth_that_they_are(tim
     np.testing.assert_array_equal(interpolation_sigma(held, fast.t_ns), interpolation_sigma(slow, fast.t_ns))
 
 
+@pytest.mark.parametrize(("step_s", "frame_s", "first_s"), [(0.1, 0.05, 0.011), (0.2, 0.033, 0.0), (0.5, 0.25, 0.0)])
+def test_interpolated_poses_are_as_wrong_as_is_said(step_s, frame_s, first_s):
+    """Everywhere between the truth's poses, or at every second of them and midway."""
+    stated, true = [], []
+    for seed in range(5):
+        rng, s = np.random.default_rng(seed), np.arange(0, 60, 0.001)
+        waves = np.sin(2 * np.pi * rng.uniform(0.02, 0.15, (6, 1, 1)) * s[:, None] + rng.uniform(0, 7, (6, 1, 6)))
+        T = se3.exp((waves * rng.uniform(0.1, 0.5, (6, 1, 6))).sum(axis=0))
+        every = TruthLog(np.rint(s * 1e9).astype(np.int64), T)
+        truth = TruthLog(every.t_ns[:: round(1e3 * step_s)], T[:: round(1e3 * step_s)])
+        frames = slice(round(1e3 * first_s), 59_000, round(1e3 * frame_s))
+        found, known = interpolate_truth(truth, every.t_ns[frames])
+        true.append((se3.log(se3.inverse(found) @ T[frames])[known] ** 2).mean(axis=0))
+        stated.append(interpolation_sigma(truth, every.t_ns[frames]) ** 2)
+    np.testing.assert_allclose(np.sqrt(np.mean(stated, axis=0) / np.mean(true, axis=0)), 1.0, atol=0.06)
+
+
 def test_a_source_that_dies_holds_its_last_pose_to_the_end():
     truth = _wound(np.arange(0, 30, 0.05))
     dead = truth.T_world_cam.copy()

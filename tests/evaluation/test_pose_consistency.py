@@ -39,8 +39,8 @@ def test_it_is_one_where_the_statement_is_true() -> None:
 
 
 def test_it_is_that_of_the_published_definitions_in_either_convention() -> None:
-    """World axes, ``p_true - p_est`` and ``R_true = Exp(e) R_est``, as by OpenVINS' global orientation error; and the
-    right perturbation with the position's error in the world, as by most filters on a manifold."""
+    """World axes, ``p_true - p_est`` and ``R_true = Exp(e) R_est``, as of ROS messages; and the right perturbation with
+    the position's error in the world, as by OpenVINS and most filters on a manifold."""
     known = np.ones(N + 1, bool)
     for seed in range(3):
         log, T_est, T_true = filtered(seed)

@@ -538,6 +538,21 @@ def test_odometry_of_others(tmp_path, kind):
     assert not records[0].covariances
 
 
+@pytest.mark.parametrize("axes", ["auto", "world", "body", "mixed"])
+def test_covariances_of_poses_may_be_stated_in_other_axes_than_ros_has(tmp_path, axes):
+    """OpenVINS' messages state the rotation's as its filter has it, in the axes of the body."""
+    C, T, maker = np.diag([1e-4, 2e-4, 3e-4, 1e-6, 2e-6, 3e-6]), seq.true_poses(20), BagMaker(False)
+    for k, t in enumerate(seq.stamps(20)):
+        B = np.eye(6)
+        B[:3, :3] = np.eye(3) if axes == "body" else T[k, :3, :3]
+        B[3:, 3:] = np.eye(3) if axes in ("body", "mixed") else T[k, :3, :3]
+        maker.pose_with_covariance("/pose", t, T[k], B @ C @ B.T)
+    log = read_foreign(maker.write(tmp_path / "bag"), covariance_axes=axes)
+    np.testing.assert_allclose(log.covariance, np.tile(C, (20, 1, 1)), atol=1e-15)
+    with pytest.raises(SourceError, match="in axes auto or world or body or mixed"):
+        read_foreign(log.path, covariance_axes="camera")
+
+
 def test_poses_of_other_frames_are_left_out_or_refused_and_so_are_those_without_a_stamp(tmp_path):
     T, C = seq.true_poses(40), np.eye(6) * 1e-4
 

@@ -72,6 +72,36 @@ def test_covariances_of_openvins_own_files_are_read(tmp_path):
     np.testing.assert_allclose(log.covariance[0][3:, 3:][np.triu_indices(3)], values[:6])
 
 
+@pytest.mark.parametrize("names", ["OpenVINS", "world"])
+def test_the_rotation_of_openvins_own_files_errs_about_axes_of_the_body(tmp_path, names):
+    """Its evaluation has ``R_true = R_est Exp(e)`` and ``p_true = p_est + e``; other columns are in the world's."""
+    i, j = np.triu_indices(3)
+    own, of_position = names == "OpenVINS", np.diag([1e-2, 4e-2, 9e-2])
+    of_rotation = np.array([[9e-4, 1e-4, 0], [1e-4, 1e-4, 0], [0, 0, 4e-4]])
+    R = POSES[:, :3, :3]
+    in_world = [R @ C @ np.swapaxes(R, 1, 2) for C in (of_position, of_rotation)]
+    stated = in_world[0], np.broadcast_to(of_rotation, (N, 3, 3)) if own else in_world[1]
+    blocks = ("Pt{}{}", 1), ("Pr{}{}", 1)
+    if not own:
+        blocks = ("cov_{}{}", 0), ("cov_{}{}", 3)
+    columns = [name.format(a + first, b + first) for name, first in blocks for a, b in zip(i, j)]
+    values = [C[:, a, b] for C in stated for a, b in zip(i, j)]
+    path = _csv(tmp_path / "a.csv", ",".join(["t_ns,p_x,p_y,p_z,q_x,q_y,q_z,q_w", *columns]), values)
+    log = read_foreign(path)
+    for block, C in ((slice(0, 3), of_position), (slice(3, 6), of_rotation)):
+        np.testing.assert_allclose(log.covariance[:, block, block], np.broadcast_to(C, (N, 3, 3)), atol=1e-9)
+    assert any("OpenVINS" in note for note in log.notes) is own
+    fixed = read_foreign(path, covariance_axes="world").covariance[-1, 3:, 3:]
+    np.testing.assert_allclose(R[-1] @ fixed @ R[-1].T, stated[1][-1], atol=1e-9)
+
+
+def test_openvins_is_least_sure_of_its_heading(real_data):
+    log = read_foreign(real_data / "openvins_mh01_cov" / "MH01_ov_est.csv")
+    least_sure = np.linalg.eigh(log.covariance[1500:, 3:, 3:])[1][:, :, -1]
+    vertical = log.trajectory.T_world_body[1500:, 2, :3]
+    assert np.abs((least_sure * vertical).sum(axis=1)).min() > 0.99
+
+
 @pytest.mark.parametrize("encoding", ["utf-16", "latin-1"])
 def test_what_is_no_text_is_said_to_be_none(tmp_path, encoding):
     (tmp_path / "log.csv").write_bytes("t,x,y\0\n1,2,3\n".encode(encoding))

@@ -211,6 +211,34 @@ def test_at_rest_against_one_reference_a_mean_cancels() -> None:
     np.testing.assert_allclose(np.diagonal(out.twist_covariance), 2e-6 / 0.01, rtol=1e-6)
 
 
+@pytest.mark.parametrize("tau_s", [np.inf, 2.0])
+def test_what_persists_makes_twists_from_one_reference_as_wrong_as_from_frame_to_frame(tau_s: float) -> None:
+    """A scale that is wrong by 3 % makes every twist wrong by 3 %; one that wanders differs more between far frames."""
+    C, zero, dt_s, scale, step = 1e-12 * np.eye(6), np.zeros((6, 6)), 0.1, 0.03, np.array([0, 0, 0.1, 0, 0, 0])
+    builder = OdometryBuilder(np.eye(4), floor=TINY)
+    builder.step(VoRecord(0, 0, Status.START, np.eye(4)))
+    for k in range(1, 9):
+        root = np.zeros((6, 6))
+        root[:, 0] = scale * k * step
+        stated = prediction(k * 10**8, zero, C, zero, 1.0, root, tau_s, dt_s=k * dt_s)
+        out = builder.step(VoRecord(k * 10**8, 0, Status.OK, se3.exp(k * step), is_reference=False), stated)
+        kept = np.exp(-dt_s / tau_s)
+        # s_k k - s_(k-1) (k - 1), with s first-order Gauss-Markov
+        expected = (scale * step[2] / dt_s) ** 2 * (k**2 + (k - 1) ** 2 - 2 * kept * k * (k - 1))
+        assert out.twist_covariance is not None
+        assert out.twist_covariance[2, 2] == pytest.approx(expected, rel=1e-6)
+
+
+def test_motions_from_one_reference_may_be_stated_with_and_without_what_persists() -> None:
+    C, zero, root = 1e-6 * np.eye(6), np.zeros((6, 6)), 1e-3 * np.eye(6)
+    builder = OdometryBuilder(np.eye(4), method="triangulation", floor=TINY)
+    builder.step(VoRecord(0, 0, Status.START, np.eye(4)))
+    record = VoRecord(10**8, 0, Status.OK, np.eye(4), is_reference=False, covariances={"triangulation": C})
+    builder.step(record)
+    out = builder.step(replace(record, t_ns=2 * 10**8), prediction(2 * 10**8, zero, C, zero, 1.0, root))
+    np.testing.assert_allclose(out.twist_covariance, (2e-6 + 1e-6) / 0.01 * np.eye(6), rtol=1e-6)
+
+
 def test_floors_lift_variances_and_keep_it_positive_definite() -> None:
     C = _spd(np.random.default_rng(1), 1e-6)
     out = lift(C, np.repeat([1e-6, 1e-4], 3))

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from gpvo.errors import GpvoError
@@ -98,6 +100,14 @@ def test_outliers_are_left_out() -> None:
     assert found is not None
     assert (found.weight[1:][wrong] == 0).mean() > 0.9
     assert np.abs(off(T_true, found.T_ref)).max() < 0.02
+
+
+@pytest.mark.filterwarnings("error")
+def test_a_view_that_loses_all_its_points_leads_nowhere() -> None:
+    given, _ = views(np.random.default_rng(4))
+    behind = given.T_ref.copy()
+    behind[1] = behind[1] @ se3.exp(np.array([0.0, 0.0, 1e3, 0.0, 0.0, 0.0]))
+    assert adjust(replace(given, T_ref=behind), PointNoise()) is None
 
 
 def test_covariance_is_that_of_the_errors() -> None:
