@@ -229,12 +229,13 @@ def odd_stretches(log: VoLog, truth: TruthLog) -> list[Stretch]:
 def _white_noise(errors: Array, stated: Array, count: int) -> Array:
     """(M, D) standard deviation of each error (M, D): what is stated tells motions apart; how large it is, the
     differences between neighbours tell, by their upper quartile over ``count`` around: no slip disturbs it."""
-    from scipy.ndimage import percentile_filter  # only evaluation and training come here
-
     steps = np.abs(np.diff(errors / stated[:, None], axis=0, append=0.0))
     steps[-1] = steps[-2]
+    around = np.pad(steps, ((count // 2, (count - 1) // 2), (0, 0)), mode="symmetric")
+    windows, rank = np.lib.stride_tricks.sliding_window_view(around, count, axis=0), 3 * count // 4
+    blocks = (windows[k : k + 1000] for k in range(0, len(windows), 1000))  # all at once would fill the memory
     # Not their median: where noise steps up, half of them are still small.
-    quartile = percentile_filter(steps, 75, size=(count, 1))
+    quartile = np.concatenate([np.partition(block, rank)[..., rank] for block in blocks])
     return np.asarray(quartile / (1.1503 * np.sqrt(2)) * stated[:, None])
 
 
