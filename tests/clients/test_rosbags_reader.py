@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -37,6 +38,23 @@ def test_every_number_comes_back(odometry: list[Odometry], tmp_path: Path, kind:
             np.testing.assert_array_equal([v.x, v.y, v.z, w.x, w.y, w.z], sent.twist_body)
             np.testing.assert_array_equal(got.pose.covariance.reshape(6, 6), sent.pose_covariance)
             np.testing.assert_array_equal(got.twist.covariance.reshape(6, 6), sent.twist_covariance)
+
+
+@pytest.mark.parametrize("kind", ["ros1", "sqlite3", "mcap"])
+def test_a_clock_that_is_set_back_reorders_no_recording(odometry: list[Odometry], tmp_path: Path, kind: str) -> None:
+    """Readers sort by the time of recording: it goes on by the steps of the stamps, which stay what they are."""
+    tracked = [o for o in odometry if o.twist_body is not None][:40]
+    sent = [replace(o, t_ns=o.t_ns - 3 * 10**9 * (k >= 20)) for k, o in enumerate(tracked)]
+    path = tmp_path / ("odometry.bag" if kind == "ros1" else "odometry")
+    write_bag(path, sent, kind=kind)
+    store = get_typestore(Stores.ROS1_NOETIC if kind == "ros1" else Stores.ROS2_HUMBLE)
+    with AnyReader([path], default_typestore=store) as reader:
+        messages = [(t_ns, reader.deserialize(raw, c.msgtype).header.stamp) for c, t_ns, raw in reader.messages()]
+    assert [s.sec * 10**9 + s.nanosec for _, s in messages] == [o.t_ns for o in sent]
+    recorded = np.array([t_ns for t_ns, _ in messages])
+    np.testing.assert_array_equal(recorded[:20], [o.t_ns for o in sent[:20]])
+    assert recorded[20] == recorded[19] + 1
+    np.testing.assert_array_equal(np.diff(recorded[20:]), np.diff([o.t_ns for o in sent[20:]]))
 
 
 def test_an_old_bag_is_replaced_and_nothing_else(odometry: list[Odometry], tmp_path: Path) -> None:
