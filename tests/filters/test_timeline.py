@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import bisect
 from dataclasses import replace
 
 import numpy as np
@@ -9,6 +10,7 @@ import pytest
 from gpvo.filters import metrics
 from gpvo.filters.eskf import ErrorStateFilter
 from gpvo.filters.measurement import BIAS, JOINT, THREE_SIGMA, Gate, chi2_cdf, chi2_quantile
+from gpvo.filters.plausible import Samples
 from gpvo.filters.policies import LearnedPolicy
 from gpvo.filters.propagation import BA, P
 from gpvo.filters.run import Flight, FuseOptions, begin, fuse_flight, make_filter
@@ -279,6 +281,16 @@ def test_where_no_motion_tells_whether_time_has_passed_the_filter_doubts_it(ahea
         timeline.add_vo(replace(r, t_ns=r.t_ns + ahead_ns, status=Status.LOST))
         nees.append(_position_nees(timeline, flight, 60))
     assert 0.1 < np.mean(nees) < 2.0
+
+
+def test_a_reading_between_two_samples_lies_on_the_line_between_them() -> None:
+    """Frames need not fall on samples; beyond the ends, the last one holds."""
+    samples, slope = Samples(), np.arange(1.0, 7.0)
+    for t_ns in (30, 10, 20, 45):
+        samples.insert(t_ns, slope * t_ns)
+    for t_ns, expected_ns in ((5, 10), (10, 10), (13, 13), (20, 20), (41, 41), (45, 45), (60, 45)):
+        found = samples.at(t_ns, bisect.bisect_right(samples.t_ns, t_ns))
+        np.testing.assert_allclose(found, slope * expected_ns, rtol=1e-12)
 
 
 @pytest.mark.parametrize("n", [3, 10])

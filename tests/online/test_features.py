@@ -8,7 +8,9 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from gpvo.geometry import se3
+from gpvo.geometry.covariance import compound
 from gpvo.online.features import AXES, FeatureStream, resolve
+from gpvo.online.observer import Window
 from gpvo.types import Status, StereoCamera, VoRecord
 
 CAMERA = StereoCamera(400.0, 400.0, 320.0, 240.0, 0.1, 640, 480)
@@ -110,6 +112,39 @@ def test_agility_is_speed_and_jerk_and_jerk_lately():
         square = (np.exp(found[lately]) - 1e-3) ** 2
         np.testing.assert_allclose(square[2:ends], size**2, rtol=1e-6)
         np.testing.assert_allclose(square[ends + 1 :], square[ends] * np.exp(-(t_s[ends + 1 :] - t_s[ends]) / 0.5))
+
+
+def test_a_motion_over_a_window_is_compounded_and_described_by_means():
+    """Of what all its motions tell: a count or an IMU that one of them lacks is unknown."""
+    rng = np.random.default_rng(1)
+    imu = ("imu_gyro_mean_radps", "imu_acc_mean_mps2", "imu_gyro_std_radps", "imu_acc_std_mps2")
+    motions = [
+        record(
+            k, TWIST + k, covariances={"triangulation": 1e-4 * k * np.eye(6)}, n_inliers=100 * k,
+            n_stereo=-1 if k == 2 else 9, brightness=0.1 * k, sharpness=float(-k),
+            **{name: rng.standard_normal(3) for name in imu},
+        )
+        for k in (1, 2, 3, 4)
+    ]  # fmt: skip
+    window = Window("window", 4 * DT_S)
+    assert [window.step(r) for r in motions[:3]] == [None] * 3
+    found = window.step(motions[3])
+    assert found is not None
+    T, C = np.eye(4), np.zeros((6, 6))
+    for r in motions:
+        T, C = T @ r.T_prev_cur, compound(r.T_prev_cur, C, r.covariances["triangulation"])
+    np.testing.assert_allclose(found.T_prev_cur, T, atol=1e-14)
+    np.testing.assert_allclose(found.covariances["triangulation"], C, atol=1e-12)
+    assert (found.t_prev_ns, found.t_ns) == (motions[0].t_prev_ns, motions[3].t_ns)
+    assert (found.n_inliers, found.n_stereo) == (250, -1)
+    assert (found.brightness, found.sharpness) == pytest.approx((0.25, -2.5))
+    for name in imu:
+        np.testing.assert_allclose(getattr(found, name), np.mean([getattr(r, name) for r in motions], axis=0))
+    silent = Window("window", 2 * DT_S)
+    silent.step(motions[0])
+    part = silent.step(replace(motions[1], imu_gyro_mean_radps=None, status=Status.DEGRADED))
+    assert part is not None
+    assert (part.imu_gyro_mean_radps, part.status) == (None, Status.DEGRADED)
 
 
 def test_a_jerk_is_that_of_three_motions_in_a_row():
