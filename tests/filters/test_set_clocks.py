@@ -138,8 +138,12 @@ def test_a_record_sent_twice_or_late_starts_no_rival() -> None:
         timeline.add_imu(*sample)
     order = list(range(len(flight.records)))
     order[60:63] = [62, 60, 61]
+    newest = -1
     for k in [*order[:100], 97, 98, *order[100:]]:
+        before = timeline._rivals
         timeline.add_vo(flight.records[k], flight.predictions.get(flight.records[k].t_ns))
+        assert k > newest or all(rival in before for rival in timeline._rivals), k
+        newest = max(newest, k)
     assert timeline.counts["clock_set_back"] == 0
     assert timeline.counts["repeated"] == 2
     _ends_alike(timeline, _usual(5))
