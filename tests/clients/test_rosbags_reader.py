@@ -13,6 +13,7 @@ from gpvo.geometry import se3
 from gpvo.publish.odometry import Odometry
 from gpvo.publish.ros import TOPIC, robot_localization_yaml, write_bag
 from rosbags.highlevel import AnyReader
+from rosbags.rosbag2 import Writer as RosbagWriter
 from rosbags.typesys import Stores, get_typestore
 
 
@@ -64,8 +65,12 @@ def test_an_old_bag_is_replaced_and_nothing_else(odometry: list[Odometry], tmp_p
     (tmp_path / "photos" / "cat.jpg").write_bytes(b"")
     with pytest.raises(GpvoError, match="not a bag of /gpvo/odometry alone"):
         write_bag(tmp_path / "photos", odometry)
-    for name in ("flight", "flight.bag"):
-        write_bag(tmp_path / name, odometry, "/camera/odometry")  # a recording
+    with RosbagWriter(tmp_path / "both", version=9) as writer:  # also where a recording holds such messages, too
+        for topic in (TOPIC, "/camera/odometry"):
+            writer.add_connection(topic, "nav_msgs/msg/Odometry", typestore=get_typestore(Stores.ROS2_HUMBLE))
+    for name in ("flight", "flight.bag", "both"):
+        if name != "both":
+            write_bag(tmp_path / name, odometry, "/camera/odometry")  # a recording
         with pytest.raises(GpvoError, match="not a bag of /gpvo/odometry alone"):
             write_bag(tmp_path / name, odometry)
 
