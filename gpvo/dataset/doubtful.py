@@ -79,10 +79,7 @@ def jumps(log: VoLog, truth: TruthLog) -> list[Stretch]:
     if not large.any():
         return []
     t_ns, t_prev_ns = log.t_ns, log.column("t_prev_ns")
-    true = [
-        VoRecord(int(t_ns[k]), int(t_prev_ns[k]), Status.OK, T)
-        for k, T in zip(errors.index, errors.T_true, strict=True)
-    ]
+    true = [VoRecord(int(t_ns[k]), int(t_prev_ns[k]), Status.OK, T) for k, T in zip(errors.index, errors.T_true)]
     far = large & ~flag_slips(replace(log, records=true)).usable & flag_slips(log).usable[errors.index]
     found: list[Stretch] = []
     for k, xi in zip(errors.index[far].tolist(), errors.xi[far], strict=True):
@@ -91,9 +88,8 @@ def jumps(log: VoLog, truth: TruthLog) -> list[Stretch]:
             first, span_ns = found[-1].first, (found[-1].t_ns[0], span_ns[1])
             found.pop()
         metres, degrees = np.linalg.norm(xi[:3]), np.rad2deg(np.linalg.norm(xi[3:]))
-        found.append(
-            Stretch(first, k, span_ns, f"truth jumps, last by {metres:.2g} m and {degrees:.2g} deg; not scored")
-        )
+        what = f"truth jumps, last by {metres:.2g} m and {degrees:.2g} deg; not scored"
+        found.append(Stretch(first, k, span_ns, what))
     return found
 
 
