@@ -26,6 +26,8 @@ from gpvo.types import MotionError, Status, VoLog
 from small_model import small_model, training_sets
 from synthetic_runs import CAMERA, make_run
 
+TUNNEL = Path(__file__).parents[2] / "models" / "tunnel.gpvo"
+
 
 @pytest.fixture
 def predictor() -> Predictor:
@@ -56,6 +58,21 @@ def test_confidence_is_the_same_in_flight_and_for_rows_of_features(predictor, fl
         said = predictor.step(record if record.dt_s == 0 else replace(record, status=Status.DEGRADED))
     alone = predictor.predict(predictor._last[1], record.covariances["pointing_matching"], said.dt_s)
     assert said.confidence == pytest.approx(alone.confidence, rel=1e-9)
+
+
+def test_a_motion_that_takes_longer_errs_by_more(predictor):
+    """Each row by its own duration; without one, by that of the training."""
+    for one in (predictor, Predictor.load(TUNNEL)):
+        x, dt_s = one.model.domain.centre, float(one.model.dt_s)
+        durations = np.array([0.5, 1.0, 3.0]) * dt_s
+        many = one.predict(np.tile(x, (3, 1)), dt_s=durations)
+        for k, duration_s in enumerate(durations):
+            np.testing.assert_allclose(many.covariance[k], one.predict(x, dt_s=duration_s).covariance, rtol=1e-12)
+        np.testing.assert_allclose(many.covariance[1], one.predict(x).covariance, rtol=1e-12)
+        np.testing.assert_allclose(many.dt_s, durations)
+        trace = np.trace(many.covariance, axis1=1, axis2=2)
+        assert trace[0] <= trace[1] <= trace[2]
+    assert trace[1] < 0.9 * trace[2]
 
 
 def test_parts_sum_to_the_covariance(predictor, flight):
