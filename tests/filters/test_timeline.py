@@ -302,6 +302,19 @@ def test_of_a_silence_anything_may_be_that_a_vehicle_does() -> None:
     np.testing.assert_allclose((filter.covariance - before)[0, V, V], np.eye(3), atol=1e-12)
 
 
+def test_a_bias_that_forgets_is_as_unsure_in_the_end_as_before_it_was_measured() -> None:
+    filter = _timeline(synthetic_flight(3, duration_s=2)).filter
+    A = np.random.default_rng(0).standard_normal((JOINT, JOINT))
+    filter.P[:] = A @ A.T
+    tau_s = np.array([0.5, 1.0, 2.0, 4.0, 8.0, np.inf])
+    before, phi = filter.P[0].copy(), np.append(np.exp(-0.7 / tau_s), np.ones(6))
+    filter.decay_bias(0.7, tau_s)
+    np.testing.assert_allclose(filter.P[0, BIAS, BIAS], np.outer(phi, phi) * before[BIAS, BIAS] + np.diag(1 - phi**2))
+    np.testing.assert_allclose(filter.P[0, :15, BIAS], before[:15, BIAS] * phi)
+    filter.decay_bias(1e6, tau_s)
+    np.testing.assert_allclose(filter.P[0, BIAS, BIAS][:5, :5], np.eye(5), atol=1e-12)
+
+
 def test_a_reading_between_two_samples_lies_on_the_line_between_them() -> None:
     """Frames need not fall on samples; beyond the ends, the last one holds."""
     samples, slope = Samples(), np.arange(1.0, 7.0)
