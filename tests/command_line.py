@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import io
+import traceback
 import warnings
 from pathlib import Path
 from typing import NamedTuple
@@ -40,4 +41,9 @@ def gpvo(*words: object, folder: Path | None = None) -> Done:
         stack.enter_context(contextlib.redirect_stderr(err))
         stop = stack.enter_context(pytest.raises(SystemExit))
         cli.main()
+    # The end of a process lets go of all that it holds, as of the lock on a run; here, errors hold their frames.
+    error: BaseException | None = stop.value
+    while error is not None:
+        traceback.clear_frames(error.__traceback__)
+        error = error.__context__
     return Done(int(stop.value.code or 0), out.getvalue(), err.getvalue())
