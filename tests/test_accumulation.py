@@ -8,10 +8,19 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from evaluation_runs import curved_path, stated_covariance
-from gpvo.accumulation import PoseError, along, over_windows
+from gpvo.accumulation import (
+    PoseError,
+    along,
+    carry,
+    first_jitter,
+    from_end,
+    from_start,
+    independent_part,
+    over_windows,
+)
 from gpvo.geometry import se3
 from gpvo.geometry.covariance import scaled_root
-from gpvo.types import MotionError
+from gpvo.types import MotionError, Status
 
 from motion_errors import motion_error
 
@@ -88,6 +97,18 @@ def test_white_noise_grows_with_frames_and_lasting_bias_with_their_square():
 def test_covariance_of_one_motion_is_the_sum_of_its_parts():
     P = PoseError().after(PATH[1], _errors(0.5, 0.3, 0.2)[1]).covariance
     np.testing.assert_allclose(P, C, atol=1e-18)
+
+
+@pytest.mark.parametrize("status", [Status.OK, Status.LOST])
+def test_what_a_motion_shares_with_others_and_what_not_is_all_of_its_noise(status):
+    """A lost one was extrapolated: it has seen no frame whose noise another could share."""
+    error, T = replace(_errors(0.5, 0.3, 0.2)[1], status=status), PATH[1]
+    start, lost = from_start(error, carry(T)), status is Status.LOST
+    ends = np.zeros((6, 6)) + from_end(error)
+    assert (not np.any(start), not ends.any()) == (lost, lost)
+    before = start * np.eye(6) if lost else start
+    shared = before @ first_jitter(T, error.jitter) @ np.transpose(before) + ends
+    np.testing.assert_allclose(shared + independent_part(error), error.jitter + error.white, rtol=1e-9, atol=1e-18)
 
 
 @pytest.mark.parametrize("parts", [(0, 1, 0), (0.5, 0.3, 0.2)])

@@ -79,10 +79,7 @@ def jumps(log: VoLog, truth: TruthLog) -> list[Stretch]:
     if not large.any():
         return []
     t_ns, t_prev_ns = log.t_ns, log.column("t_prev_ns")
-    true = [
-        VoRecord(int(t_ns[k]), int(t_prev_ns[k]), Status.OK, T)
-        for k, T in zip(errors.index, errors.T_true, strict=True)
-    ]
+    true = [VoRecord(int(t_ns[k]), int(t_prev_ns[k]), Status.OK, T) for k, T in zip(errors.index, errors.T_true)]
     far = large & ~flag_slips(replace(log, records=true)).usable & flag_slips(log).usable[errors.index]
     found: list[Stretch] = []
     for k, xi in zip(errors.index[far].tolist(), errors.xi[far], strict=True):
@@ -91,9 +88,8 @@ def jumps(log: VoLog, truth: TruthLog) -> list[Stretch]:
             first, span_ns = found[-1].first, (found[-1].t_ns[0], span_ns[1])
             found.pop()
         metres, degrees = np.linalg.norm(xi[:3]), np.rad2deg(np.linalg.norm(xi[3:]))
-        found.append(
-            Stretch(first, k, span_ns, f"truth jumps, last by {metres:.2g} m and {degrees:.2g} deg; not scored")
-        )
+        what = f"truth jumps, last by {metres:.2g} m and {degrees:.2g} deg; not scored"
+        found.append(Stretch(first, k, span_ns, what))
     return found
 
 
@@ -229,12 +225,13 @@ def odd_stretches(log: VoLog, truth: TruthLog) -> list[Stretch]:
 def _white_noise(errors: Array, stated: Array, count: int) -> Array:
     """(M, D) standard deviation of each error (M, D): what is stated tells motions apart; how large it is, the
     differences between neighbours tell, by their upper quartile over ``count`` around: no slip disturbs it."""
-    from scipy.ndimage import percentile_filter  # only evaluation and training come here
-
     steps = np.abs(np.diff(errors / stated[:, None], axis=0, append=0.0))
     steps[-1] = steps[-2]
+    around = np.pad(steps, ((count // 2, (count - 1) // 2), (0, 0)), mode="symmetric")
+    windows, rank = np.lib.stride_tricks.sliding_window_view(around, count, axis=0), 3 * count // 4
+    blocks = (windows[k : k + 1000] for k in range(0, len(windows), 1000))  # all at once would fill the memory
     # Not their median: where noise steps up, half of them are still small.
-    quartile = percentile_filter(steps, 75, size=(count, 1))
+    quartile = np.concatenate([np.partition(block, rank)[..., rank] for block in blocks])
     return np.asarray(quartile / (1.1503 * np.sqrt(2)) * stated[:, None])
 
 

@@ -20,14 +20,10 @@ from gpvo.io.run import write_run
 from synthetic_runs import make_run
 from typer.testing import CliRunner
 
+from command_line import gpvo
+
 ROOT = Path(__file__).parents[2]
 UNSEEN, MODEL = str(ROOT / "data" / "unseen"), str(ROOT / "models" / "tunnel.gpvo")
-
-
-def call(*words: str, folder: Path | None = None) -> subprocess.CompletedProcess[str]:
-    line = [sys.executable, "-m", "gpvo", *words]
-    env = {**os.environ, "COLUMNS": "80"}
-    return subprocess.run(line, capture_output=True, text=True, timeout=120, cwd=folder, env=env)
 
 
 def test_every_command_is_in_one_group_and_has_the_common_options():
@@ -58,9 +54,9 @@ main()
 def test_a_file_gives_options_and_the_line_replaces_them(tmp_path: Path):
     (tmp_path / "o.toml").write_text('\ufeff[evaluate]\nsegments = "5"\njson = false\n[train]\nseed = 3\n')
     config = ("--config", str(tmp_path / "o.toml"))
-    given = call("evaluate", UNSEEN, *config)
+    given = gpvo("evaluate", UNSEEN, *config)
     assert "  5 m segments" in given.stdout, given.stderr
-    replaced = call("evaluate", UNSEEN, *config, "--segments", "7")
+    replaced = gpvo("evaluate", UNSEEN, *config, "--segments", "7")
     assert "  7 m segments" in replaced.stdout
     assert "  5 m segments" not in replaced.stdout
 
@@ -79,14 +75,14 @@ def test_a_file_gives_options_and_the_line_replaces_them(tmp_path: Path):
 )
 def test_what_a_file_gets_wrong_is_one_line(tmp_path: Path, text: str, told: str):
     (tmp_path / "o.toml").write_text(text)
-    done = call("evaluate", UNSEEN, "--config", str(tmp_path / "o.toml"))
+    done = gpvo("evaluate", UNSEEN, "--config", str(tmp_path / "o.toml"))
     assert done.returncode == 2
     assert done.stderr.count("\n") == 1
     assert told in done.stderr
 
 
 def test_a_file_of_options_that_is_missing_is_refused_as_any_other_file(tmp_path: Path):
-    done = call("evaluate", UNSEEN, "--config", "o.toml", folder=tmp_path)
+    done = gpvo("evaluate", UNSEEN, "--config", "o.toml", folder=tmp_path)
     assert done.stderr == "gpvo: o.toml: cannot be read: No such file or directory\n"
 
 
@@ -122,16 +118,16 @@ def test_options_are_declared_by_type_and_help_also_in_settings_of_settings():
     "words", [("evaluate",), ("nonsense",), ("evaluate", "--seed", "x", "r"), ("run", "--nothing")]
 )
 def test_a_wrong_line_is_one_line(words: tuple[str, ...]):
-    done = call(*words)
+    done = gpvo(*words)
     assert done.returncode == 2
     assert done.stderr.count("\n") == 1
     assert "--help" in done.stderr
 
 
 def test_verbose_says_what_it_took_and_shows_where_it_failed():
-    done = call("info", UNSEEN, "-v")
+    done = gpvo("info", UNSEEN, "-v")
     assert "gpvo: took" in done.stderr
-    failed = call("evaluate", "nowhere", "-v")
+    failed = gpvo("evaluate", "nowhere", "-v")
     assert failed.returncode == 2
     assert "Traceback" in failed.stderr
 
@@ -141,14 +137,14 @@ def on_a_terminal(*words: str) -> str:
     pty = pytest.importorskip("pty", reason="this system has no pseudo-terminals")
     ours, theirs = pty.openpty()
     env = {**os.environ, "COLUMNS": "80", "TERM": "xterm"}
-    with subprocess.Popen([sys.executable, "-m", "gpvo", *words], stdout=theirs, stderr=theirs, env=env) as call:
+    with subprocess.Popen([sys.executable, "-m", "gpvo", *words], stdout=theirs, stderr=theirs, env=env) as process:
         os.close(theirs)
         parts = []
         with suppress(OSError):  # the end of a terminal
             while part := os.read(ours, 4096):
                 parts.append(part)
     os.close(ours)
-    assert call.returncode == 0
+    assert process.returncode == 0
     return re.sub(r"\x1b\[[?0-9;]*[a-zA-Z]", "", b"".join(parts).decode())
 
 
@@ -163,15 +159,15 @@ def test_training_shows_how_far_it_is_and_how_long_it_will_take(tmp_path: Path):
     assert steps == sorted(steps)
     assert re.search(r"2/3 0:00:\d\d", shown)
     assert steps[-1] < shown.index("left out")
-    piped = call(*words[:-2], "--features", "velocity", "-q")
+    piped = gpvo(*words[:-2], "--features", "velocity", "-q")
     assert "/3" not in piped.stdout + piped.stderr
 
 
 def test_a_shell_completes_the_commands():
     env = {**os.environ, "_GPVO_COMPLETE": "complete_bash", "COMP_WORDS": "gpvo ev", "COMP_CWORD": "1"}
-    gpvo = shutil.which("gpvo", path=str(Path(sys.executable).parent))
-    assert gpvo is not None
-    done = subprocess.run([gpvo], capture_output=True, text=True, timeout=60, env=env)
+    script = shutil.which("gpvo", path=str(Path(sys.executable).parent))
+    assert script is not None
+    done = subprocess.run([script], capture_output=True, text=True, timeout=60, env=env)
     assert done.stdout.split() == ["evaluate"]
 
 
@@ -186,7 +182,7 @@ def test_a_narrow_terminal_breaks_no_number_and_a_closed_one_no_command():
 
 
 def test_tables_fit_80_columns():
-    done = call("evaluate", UNSEEN, "--model", MODEL, "--truth-sigma", "0.01")
+    done = gpvo("evaluate", UNSEEN, "--model", MODEL, "--truth-sigma", "0.01")
     rows = [
         line for line in done.stdout.splitlines() if line.startswith(("method", "triangulation_", "pointing_", "base"))
     ]
@@ -197,17 +193,17 @@ def test_tables_fit_80_columns():
 
 def test_several_runs_are_predicted_and_judged_together(tmp_path: Path):
     runs = [str(ROOT / "data" / f"tunnel-{k}") for k in (1, 2, 3)]
-    done = call("predict", MODEL, *runs, "-o", str(tmp_path / "out"))
+    done = gpvo("predict", MODEL, *runs, "-o", str(tmp_path / "out"))
     assert done.returncode == 0, done.stderr
     assert sorted(p.name for p in (tmp_path / "out").iterdir()) == [f"tunnel-{k}.parquet" for k in (1, 2, 3)]
     shutil.copytree(runs[0], tmp_path / "run")
-    refused = call("predict", MODEL, str(tmp_path / "run"), "-o", str(tmp_path / "run" / "truth.parquet"))
+    refused = gpvo("predict", MODEL, str(tmp_path / "run"), "-o", str(tmp_path / "run" / "truth.parquet"))
     assert refused.returncode == 2
     assert "is part of a run" in refused.stderr
-    told = call("evaluate", *runs).stdout
+    told = gpvo("evaluate", *runs).stdout
     assert "mean of the 3 runs" in told
     assert "NEES with the truth's own noise taken into account, NLL without" in told
-    two = call("evaluate", *runs[:2]).stdout
+    two = gpvo("evaluate", *runs[:2]).stdout
     assert "mean of the 2 runs: too few for an interval" in two
 
 
@@ -220,10 +216,10 @@ def test_several_runs_are_predicted_and_judged_together(tmp_path: Path):
 def test_what_takes_minutes_of_a_long_run_shows_on_a_terminal_that_it_works(
     words: tuple[str, ...], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ):
-    assert "runs" not in call(*words, folder=tmp_path).stderr
+    assert "runs" not in gpvo(*words, folder=tmp_path).stderr
     monkeypatch.setenv("FORCE_COLOR", "1")  # rich takes it for a terminal
     shutil.rmtree(tmp_path / "out", ignore_errors=True)
-    done = call(*words, folder=tmp_path)
+    done = gpvo(*words, folder=tmp_path)
     assert "runs" in done.stderr
     assert "0/1" not in done.stdout
 
@@ -240,12 +236,12 @@ def test_a_model_that_does_not_fit_is_named_at_once_and_at_the_end(tmp_path: Pat
     records = [replace(r, disparity_p50_px=9 * r.disparity_p50_px, brightness=0.01, contrast=9.0) for r in run.log]
     write_run(tmp_path / "other", VoLog(records, wide), truth=run.truth, imu=run.imu, mounting=run.mounting)
     for words in (("evaluate",), ("report", "-o", str(tmp_path / "r.html"))):
-        done = call(words[0], str(tmp_path / "other"), "--model", MODEL, *words[1:])
+        done = gpvo(words[0], str(tmp_path / "other"), "--model", MODEL, *words[1:])
         assert done.returncode == 0, done.stderr
         lines = done.stderr.strip().splitlines()
         assert "tunnel.gpvo does not fit other: baseline is 0.6" in done.stderr
         assert "do not fly it there" in lines[-1]
-    fused = call("fuse", str(tmp_path / "other"), "--model", MODEL, "--policies", "triangulation,learned")
+    fused = gpvo("fuse", str(tmp_path / "other"), "--model", MODEL, "--policies", "triangulation,learned")
     assert "the model does not fit: baseline is 0.6" in fused.stderr
 
 

@@ -12,7 +12,6 @@ import pytest
 import sequences as seq
 from bag_maker import stereo_bag
 from foreign_trajectories import write_euroc_csv, write_kitti_poses
-from gpvo import cli
 from gpvo.cameras.models import PinholeRadtan
 from gpvo.errors import SourceError
 from gpvo.files import write_json
@@ -22,6 +21,8 @@ from gpvo.io.trajectory import write_tum
 from gpvo.types import Status, StereoCamera, Vehicle, VoLog, VoRecord
 from gpvo.vo.rig_error import RigState
 from gpvo.vo.rig_findings import document
+
+from command_line import gpvo
 
 N = 400
 T_NS = np.array([1_403_636_579_763_555_584 + k * 50_000_000 for k in range(N)])
@@ -35,21 +36,6 @@ def _poses(n: int = N) -> np.ndarray:
     return se3.from_rt(se3.so3_exp(phi), t)
 
 
-@pytest.fixture
-def gpvo(monkeypatch, capsys):
-    """Run the command line; gives (exit code, output, errors)."""
-
-    def call(*words: object) -> tuple[int, str, str]:
-        monkeypatch.setattr("sys.argv", ["gpvo", *map(str, words)])
-        with pytest.raises(SystemExit) as stop:
-            cli.main()
-        out = capsys.readouterr()
-        code = stop.value.code
-        return (0 if code is None else int(code)), out.out, out.err
-
-    return call
-
-
 @pytest.mark.parametrize(
     ("make", "what", "fmt"),
     [
@@ -58,7 +44,7 @@ def gpvo(monkeypatch, capsys):
         (seq.write_folder, "sequence", "folder"),
     ],
 )
-def test_info_of_sequences(gpvo, tmp_path, make, what, fmt):
+def test_info_of_sequences(tmp_path, make, what, fmt):
     path = make(tmp_path / "s")
     code, out, _ = gpvo("info", path, "--json")
     document = json.loads(out)
@@ -71,7 +57,7 @@ def test_info_of_sequences(gpvo, tmp_path, make, what, fmt):
     assert "frames: 12" in out
 
 
-def test_info_of_other_files(gpvo, tmp_path):
+def test_info_of_other_files(tmp_path):
     poses = _poses()
     write_tum(tmp_path / "a.txt", T_NS, poses)
     write_kitti_poses(tmp_path / "b.txt", poses)
@@ -98,7 +84,7 @@ def test_info_of_other_files(gpvo, tmp_path):
     assert "baseline_m: P0 P1 0.1, P2 P3 0.1" in gpvo("info", tmp_path / "s" / "calib.txt")[1]
 
 
-def test_info_of_a_bag(gpvo, tmp_path):
+def test_info_of_a_bag(tmp_path):
     from bag_maker import BagMaker, stereo_bag
 
     code, out, _ = gpvo("info", stereo_bag(True).write(tmp_path / "a.bag"), "--json")
@@ -118,7 +104,7 @@ def test_info_of_a_bag(gpvo, tmp_path):
 @pytest.mark.parametrize(
     "what", ["nothing", "empty", "rubbish.txt", "rubbish.bag", "rubbish.npz", "rubbish.yaml", "a.parquet"]
 )
-def test_info_of_what_is_not_known(gpvo, tmp_path, what):
+def test_info_of_what_is_not_known(tmp_path, what):
     path = tmp_path / what
     if what == "empty":
         path.mkdir()
@@ -131,7 +117,7 @@ def test_info_of_what_is_not_known(gpvo, tmp_path, what):
     assert str(path) in err
 
 
-def test_import_of_a_perfect_log(gpvo, tmp_path):
+def test_import_of_a_perfect_log(tmp_path):
     poses = _poses()
     write_tum(tmp_path / "est.txt", T_NS, poses)
     write_euroc_csv(tmp_path / "gt.csv", T_NS, poses)
@@ -147,7 +133,7 @@ def test_import_of_a_perfect_log(gpvo, tmp_path):
     assert run.truth is not None
 
 
-def test_a_run_keeps_what_its_slips_are_told_by(gpvo, tmp_path):
+def test_a_run_keeps_what_its_slips_are_told_by(tmp_path):
     write_tum(tmp_path / "log", T_NS, _poses())
     words = ("--vehicle", "car", "--max-turn", "7.5")
     assert gpvo("import", tmp_path / "log", "-o", tmp_path / "run", *words)[0] == 0
@@ -158,7 +144,7 @@ def test_a_run_keeps_what_its_slips_are_told_by(gpvo, tmp_path):
         read_run(tmp_path / "run")
 
 
-def test_the_columns_of_a_truth_are_named_like_those_of_a_log(gpvo, tmp_path):
+def test_the_columns_of_a_truth_are_named_like_those_of_a_log(tmp_path):
     write_tum(tmp_path / "est.txt", T_NS, _poses())
     write_euroc_csv(tmp_path / "gt.csv", T_NS, _poses())
     lines = (tmp_path / "gt.csv").read_text().splitlines()
@@ -176,7 +162,7 @@ def test_the_columns_of_a_truth_are_named_like_those_of_a_log(gpvo, tmp_path):
     assert json.loads(out)["with_truth"] == N
 
 
-def test_import_finds_rotation_and_time_offset(gpvo, tmp_path):
+def test_import_finds_rotation_and_time_offset(tmp_path):
     """The truth is of a body turned against the camera, and the log's clock runs 120 ms late."""
     poses = _poses()
     R = se3.so3_exp(np.array([0.9, -1.2, 0.7]))
@@ -219,7 +205,7 @@ def test_import_finds_rotation_and_time_offset(gpvo, tmp_path):
         (["{log}", "-o", "{taken}"], "not a run"),
     ],
 )
-def test_import_refuses_in_one_line(gpvo, tmp_path, words, reason):
+def test_import_refuses_in_one_line(tmp_path, words, reason):
     files = {k: tmp_path / k for k in ("log", "out", "late", "nan", "missing", "taken", "positions", "laser")}
     write_tum(files["log"], T_NS, _poses())
     write_tum(files["late"], T_NS + 10**12, _poses())
@@ -238,7 +224,7 @@ def test_import_refuses_in_one_line(gpvo, tmp_path, words, reason):
     assert out == ""
 
 
-def test_import_of_real_logs(gpvo, real_data, tmp_path):
+def test_import_of_real_logs(real_data, tmp_path):
     kitti, euroc = real_data / "kitti_stereo_vo", real_data / "euroc_v1_01_vo"
     code, out, _ = gpvo("import", kitti / "07_est.txt", "--truth", kitti / "07_gt.txt", "-o", tmp_path / "k", "--json")
     assert code == 0
@@ -273,7 +259,7 @@ def test_a_camera_is_described_by_plain_numbers(tmp_path):
     json.dumps(StereoRig(lens, lens, seq.T_RIGHT_LEFT).describe())
 
 
-def test_simulated_log_with_turned_truth_is_put_right(gpvo, tmp_path):
+def test_simulated_log_with_turned_truth_is_put_right(tmp_path):
     """Odometry on simulated tracks, written as TUM; its truth in a tracker's frame, turned, on a clock 250 ms ahead."""
     from gpvo.dataset.errors import motion_errors
     from gpvo.io import open_source
@@ -310,7 +296,7 @@ def test_python_m_gpvo_is_the_command_line():
     assert done.stdout.startswith("gpvo ")
 
 
-def test_run_says_what_the_source_remarks(gpvo, tmp_path):
+def test_run_says_what_the_source_remarks(tmp_path):
     path = stereo_bag(True).write(tmp_path / "a.bag")
     code, out, err = gpvo("run", path, "-o", tmp_path / "run", "--preset", "thesis", "--json")
     assert code == 0
@@ -331,7 +317,7 @@ def test_run_says_what_the_source_remarks(gpvo, tmp_path):
         (BrokenPipeError(errno.EPIPE, "Broken pipe"), 1, ""),
     ],
 )
-def test_failures_of_the_system_in_one_line(gpvo, monkeypatch, tmp_path, error, code, line):
+def test_failures_of_the_system_in_one_line(monkeypatch, tmp_path, error, code, line):
     def fail(*_: object) -> None:
         raise error
 
@@ -344,7 +330,7 @@ def test_failures_of_the_system_in_one_line(gpvo, monkeypatch, tmp_path, error, 
     assert len(err.splitlines()) == (1 if line else 0)
 
 
-def test_pair_tolerance(gpvo, tmp_path):
+def test_pair_tolerance(tmp_path):
     path = seq.write_euroc(tmp_path / "s")
     late = [f"{t + 4_000_000},{t}.png" for t in seq.stamps(12)]
     (path / "mav0" / "cam1" / "data.csv").write_text("\n".join(late))
@@ -355,7 +341,7 @@ def test_pair_tolerance(gpvo, tmp_path):
     assert (code, json.loads(out)["frames"]) == (0, 12)
 
 
-def test_numbered_images_as_their_refusal_advises(gpvo, tmp_path):
+def test_numbered_images_as_their_refusal_advises(tmp_path):
     path = seq.write_folder(tmp_path / "s")
     for k, file in enumerate(sorted((path / "left").iterdir())):
         (path / "right" / file.name).rename(path / "right" / f"{k:04d}.png")
@@ -368,7 +354,7 @@ def test_numbered_images_as_their_refusal_advises(gpvo, tmp_path):
 
 
 @pytest.mark.parametrize(("term", "told"), [(0, "0.00 px remain"), (10, "--calibration-state")])
-def test_what_a_corrected_calibration_leaves(gpvo, tmp_path, term, told):
+def test_what_a_corrected_calibration_leaves(tmp_path, term, told):
     """A shift, and a bend of fourth order, which neither a rotation nor a focal length explains."""
     camera = StereoCamera(380.0, 380.0, 319.5, 239.5, 0.12, 640, 480)
     write_run(tmp_path / "r", VoLog([VoRecord(0, 0, Status.START, np.eye(4))], camera=camera))

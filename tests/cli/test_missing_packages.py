@@ -74,7 +74,7 @@ def test_what_flies_needs_numpy_and_safetensors_alone() -> None:
     "words", [("evaluate", "--stated", "said"), ("fuse", "--plot", "said.png")], ids=["evaluate", "fuse"]
 )
 def test_a_model_is_judged_without_what_trains_it(words: tuple[str, str, str], tmp_path: Path) -> None:
-    absent = ("torch", "gpytorch", "sklearn", "numba", "mujoco", "embreex", "rosbags")
+    absent = ("torch", "gpytorch", "sklearn", "scipy", "numba", "mujoco", "embreex", "rosbags")
     model = str(ROOT / "models" / "tunnel.gpvo")
     command, option, name = words
     files = ("--model", model, option, str(tmp_path / name))

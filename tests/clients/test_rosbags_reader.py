@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -12,6 +13,7 @@ from gpvo.geometry import se3
 from gpvo.publish.odometry import Odometry
 from gpvo.publish.ros import TOPIC, robot_localization_yaml, write_bag
 from rosbags.highlevel import AnyReader
+from rosbags.rosbag2 import Writer as RosbagWriter
 from rosbags.typesys import Stores, get_typestore
 
 
@@ -39,6 +41,23 @@ def test_every_number_comes_back(odometry: list[Odometry], tmp_path: Path, kind:
             np.testing.assert_array_equal(got.twist.covariance.reshape(6, 6), sent.twist_covariance)
 
 
+@pytest.mark.parametrize("kind", ["ros1", "sqlite3", "mcap"])
+def test_a_clock_that_is_set_back_reorders_no_recording(odometry: list[Odometry], tmp_path: Path, kind: str) -> None:
+    """Readers sort by the time of recording: it goes on by the steps of the stamps, which stay what they are."""
+    tracked = [o for o in odometry if o.twist_body is not None][:40]
+    sent = [replace(o, t_ns=o.t_ns - 3 * 10**9 * (k >= 20)) for k, o in enumerate(tracked)]
+    path = tmp_path / ("odometry.bag" if kind == "ros1" else "odometry")
+    write_bag(path, sent, kind=kind)
+    store = get_typestore(Stores.ROS1_NOETIC if kind == "ros1" else Stores.ROS2_HUMBLE)
+    with AnyReader([path], default_typestore=store) as reader:
+        messages = [(t_ns, reader.deserialize(raw, c.msgtype).header.stamp) for c, t_ns, raw in reader.messages()]
+    assert [s.sec * 10**9 + s.nanosec for _, s in messages] == [o.t_ns for o in sent]
+    recorded = np.array([t_ns for t_ns, _ in messages])
+    np.testing.assert_array_equal(recorded[:20], [o.t_ns for o in sent[:20]])
+    assert recorded[20] == recorded[19] + 1
+    np.testing.assert_array_equal(np.diff(recorded[20:]), np.diff([o.t_ns for o in sent[20:]]))
+
+
 def test_an_old_bag_is_replaced_and_nothing_else(odometry: list[Odometry], tmp_path: Path) -> None:
     write_bag(tmp_path / "bag", odometry)
     assert write_bag(tmp_path / "bag", odometry[:10], kind="mcap") == 9
@@ -46,8 +65,12 @@ def test_an_old_bag_is_replaced_and_nothing_else(odometry: list[Odometry], tmp_p
     (tmp_path / "photos" / "cat.jpg").write_bytes(b"")
     with pytest.raises(GpvoError, match="not a bag of /gpvo/odometry alone"):
         write_bag(tmp_path / "photos", odometry)
-    for name in ("flight", "flight.bag"):
-        write_bag(tmp_path / name, odometry, "/camera/odometry")  # a recording
+    with RosbagWriter(tmp_path / "both", version=9) as writer:  # also where a recording holds such messages, too
+        for topic in (TOPIC, "/camera/odometry"):
+            writer.add_connection(topic, "nav_msgs/msg/Odometry", typestore=get_typestore(Stores.ROS2_HUMBLE))
+    for name in ("flight", "flight.bag", "both"):
+        if name != "both":
+            write_bag(tmp_path / name, odometry, "/camera/odometry")  # a recording
         with pytest.raises(GpvoError, match="not a bag of /gpvo/odometry alone"):
             write_bag(tmp_path / name, odometry)
 

@@ -11,6 +11,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from gpvo.dataset import doubtful
 from gpvo.dataset.build import build
 from gpvo.dataset.doubtful import in_waits, jumps, odd_stretches, wandering_waits
 from gpvo.errors import GpvoError
@@ -29,6 +30,7 @@ from gpvo.sim.points import simulate_points
 from gpvo.stats.consistency import nll_per_dim
 from gpvo.types import ImuMoments, Status, StereoCamera, TruthLog, VoLog, VoRecord
 from gpvo.vo.config import make_config
+from scipy.ndimage import percentile_filter
 from synthetic_runs import make_run
 
 # Simulated flights begin at rest.
@@ -277,6 +279,17 @@ def white_noise_run(seed: int, rate_hz: int, stepped: bool, speed_mps: float = 1
     records += [VoRecord(int(b), int(a), Status.OK, T) for a, b, T in zip(t_ns, t_ns[1:], T_est)]
     poses = list(accumulate(T_true, np.matmul, initial=np.eye(4)))
     return VoLog(records, None), TruthLog(t_ns, np.array(poses))
+
+
+@pytest.mark.parametrize(("n", "count"), [(100, 50), (101, 50), (333, 77), (2500, 501)])
+def test_noise_is_told_by_scipys_percentile_around_each_motion(n, count):
+    rng = np.random.default_rng(n)
+    errors, stated = rng.standard_normal((n, 4)), rng.uniform(0.1, 1.0, n)
+    steps = np.abs(np.diff(errors / stated[:, None], axis=0))
+    quartile = percentile_filter(np.concatenate([steps, steps[-1:]]), 75, size=(count, 1))
+    # The upper quartile of the size of a Gaussian is 1.1503 standard deviations; a step has two of noise.
+    expected = quartile / (1.1503 * np.sqrt(2)) * stated[:, None]
+    np.testing.assert_array_equal(doubtful._white_noise(errors, stated, count), expected)
 
 
 def test_honest_white_noise_raises_no_alarm_at_any_rate():

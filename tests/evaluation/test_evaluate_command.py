@@ -9,7 +9,6 @@ from pathlib import Path
 import numpy as np
 import pytest
 from evaluation_runs import make_run, stated_covariance
-from gpvo import cli
 from gpvo.dataset.build import build
 from gpvo.errors import ModelError
 from gpvo.evaluation.document import document
@@ -27,6 +26,7 @@ from gpvo.types import IMPORTED_POSE, Mounting, Prediction, Status, TruthLog, Vo
 from small_model import small_model
 from synthetic_runs import make_run as synthetic_run
 
+from command_line import gpvo
 from motion_errors import prediction
 
 RUN_KEYS = {"run", "source", "frames", "lost", "path_length_m", "ate_rmse_m", "rmse_origin_m", "final_error_m"}
@@ -49,26 +49,16 @@ def run_folder(tmp_path_factory) -> Path:
     return path
 
 
-def _main(capsys, *args: object) -> tuple[int, str, str]:
-    """Exit code, standard output and standard error of a command, in this process."""
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr("sys.argv", ["gpvo", *map(str, args)])
-        with pytest.raises(SystemExit) as stop:
-            cli.main()
-    out, err = capsys.readouterr()
-    return int(stop.value.code or 0), out, err
-
-
-def _assert_refused(capsys, *args: object, says: str) -> None:
-    code, out, err = _main(capsys, "evaluate", *args)
+def _assert_refused(*args: object, says: str) -> None:
+    code, out, err = gpvo("evaluate", *args)
     assert code == 2
     assert out == ""
     assert len(err.strip().splitlines()) == 1
     assert says in err
 
 
-def test_json_has_every_name_of_the_interface(capsys, run_folder):
-    code, out, _ = _main(capsys, "evaluate", run_folder, "--json")
+def test_json_has_every_name_of_the_interface(run_folder):
+    code, out, _ = gpvo("evaluate", run_folder, "--json")
     assert code == 0
     found = json.loads(out, parse_constant=lambda name: pytest.fail(f"{name} is not JSON"))
     assert found["schema"] == 1
@@ -99,8 +89,8 @@ def test_json_has_every_name_of_the_interface(capsys, run_folder):
         assert (last["length_m"], last["nees_dof"], last["count"]) == (100.0, None, 0)
 
 
-def test_the_table_names_the_methods(capsys, run_folder):
-    code, out, _ = _main(capsys, "evaluate", run_folder, "--segments", "5,10")
+def test_the_table_names_the_methods(run_folder):
+    code, out, _ = gpvo("evaluate", run_folder, "--segments", "5,10")
     assert code == 0
     for word in (
         "hall: 301 frames, 1 lost",
@@ -113,20 +103,20 @@ def test_the_table_names_the_methods(capsys, run_folder):
         assert word in out
 
 
-def test_spans_that_the_path_is_too_short_for_are_not_told(capsys, run_folder, tmp_path):
+def test_spans_that_the_path_is_too_short_for_are_not_told(run_folder, tmp_path):
     run = read_run(run_folder)
     write_run(tmp_path / "short", replace(run.log, records=run.log.records[:20]), truth=run.truth)
-    _, out, _ = _main(capsys, "evaluate", tmp_path / "short")
+    _, out, _ = gpvo("evaluate", tmp_path / "short")
     told = next(line for line in out.splitlines() if "relative error" in line)
     assert "over a frame" in told
     assert "10 m" not in told
 
 
 @pytest.mark.parametrize("name", ["flight[red]", "[dim]"])
-def test_a_name_is_printed_as_it_is(capsys, run_folder, tmp_path, name):
+def test_a_name_is_printed_as_it_is(run_folder, tmp_path, name):
     run = read_run(run_folder)
     write_run(tmp_path / name, run.log, truth=run.truth)
-    code, out, _ = _main(capsys, "evaluate", tmp_path / name)
+    code, out, _ = gpvo("evaluate", tmp_path / name)
     assert code == 0
     assert out.startswith(f"{name}: 301 frames")
 
@@ -153,11 +143,11 @@ def test_parts_make_another_final_error_than_independence(run_folder):
     assert c.predicted_final_error_m != pytest.approx(c.predicted_final_error_independent_m, rel=0.01)
 
 
-def test_several_runs_and_truth_from_a_file(capsys, run_folder, tmp_path):
+def test_several_runs_and_truth_from_a_file(run_folder, tmp_path):
     run = read_run(run_folder)
     write_run(tmp_path / "bare", run.log)
     write_tum(tmp_path / "truth.tum", run.truth.t_ns, run.truth.T_world_cam)
-    code, out, _ = _main(capsys, "evaluate", tmp_path / "bare", run_folder, "--truth", tmp_path / "truth.tum", "--json")
+    code, out, _ = gpvo("evaluate", tmp_path / "bare", run_folder, "--truth", tmp_path / "truth.tum", "--json")
     assert code == 0
     bare, full = json.loads(out)["runs"]
     assert (bare["run"], full["run"]) == ("bare", "hall")
@@ -195,55 +185,55 @@ def _motions(log: VoLog) -> np.ndarray:
     return se3.inverse(T[:-1]) @ T[1:]
 
 
-def test_bad_flags_are_one_line(capsys, run_folder):
+def test_bad_flags_are_one_line(run_folder):
     for value in ("ten", "", "0", "-5", "nan", "10,,20", "inf"):
-        _assert_refused(capsys, run_folder, "--segments", value, says="--segments")
+        _assert_refused(run_folder, "--segments", value, says="--segments")
     for value in ("x", "-1", "1,2,3", "nan"):
-        _assert_refused(capsys, run_folder, f"--truth-sigma={value}", says="--truth-sigma")
+        _assert_refused(run_folder, f"--truth-sigma={value}", says="--truth-sigma")
     for value in ("soon", "nan", "1,2"):
-        _assert_refused(capsys, run_folder, "--time-offset", value, says="--time-offset")
-    _assert_refused(capsys, run_folder, "--align", "sideways", says="sideways")
+        _assert_refused(run_folder, "--time-offset", value, says="--time-offset")
+    _assert_refused(run_folder, "--align", "sideways", says="sideways")
 
 
 @pytest.mark.parametrize("command", ["evaluate", "report", "fuse", "score"])
-def test_one_run_given_twice_is_refused(capsys, run_folder, command):
+def test_one_run_given_twice_is_refused(run_folder, command):
     """Three times the same run had a mean with an interval of no width."""
-    code, out, err = _main(capsys, command, run_folder, run_folder.parent / "." / run_folder.name)
+    code, out, err = gpvo(command, run_folder, run_folder.parent / "." / run_folder.name)
     assert (code, out) == (2, "")
     assert "hall: is given twice" in err
 
 
-def test_a_run_without_truth_is_one_line(capsys, run_folder, tmp_path):
+def test_a_run_without_truth_is_one_line(run_folder, tmp_path):
     write_run(tmp_path / "blind", read_run(run_folder).log)
-    _assert_refused(capsys, tmp_path / "blind", says="blind: has no ground truth")
+    _assert_refused(tmp_path / "blind", says="blind: has no ground truth")
 
 
-def test_truth_of_another_day_is_one_line(capsys, run_folder, tmp_path):
+def test_truth_of_another_day_is_one_line(run_folder, tmp_path):
     run = read_run(run_folder)
     write_run(tmp_path / "other", run.log, truth=replace(run.truth, t_ns=run.truth.t_ns + 10**15))
-    _assert_refused(capsys, tmp_path / "other", says="do not overlap")
+    _assert_refused(tmp_path / "other", says="do not overlap")
 
 
-def test_what_is_no_run_is_one_line(capsys, tmp_path):
-    _assert_refused(capsys, tmp_path / "nowhere", says="nowhere")
+def test_what_is_no_run_is_one_line(tmp_path):
+    _assert_refused(tmp_path / "nowhere", says="nowhere")
     (tmp_path / "empty").mkdir()
-    _assert_refused(capsys, tmp_path / "empty", says="empty")
+    _assert_refused(tmp_path / "empty", says="empty")
 
 
-def test_a_run_that_was_lost_throughout_is_evaluated(capsys, tmp_path):
+def test_a_run_that_was_lost_throughout_is_evaluated(tmp_path):
     log, truth = make_run(30, lost=range(1, 31))
     write_run(tmp_path / "dark", log, truth=truth)
-    code, out, _ = _main(capsys, "evaluate", tmp_path / "dark", "--json", "--plots", tmp_path / "pictures")
+    code, out, _ = gpvo("evaluate", tmp_path / "dark", "--json", "--plots", tmp_path / "pictures")
     assert code == 0
     (run,) = json.loads(out)["runs"]
     assert run["lost"] == 30
     assert run["methods"]["triangulation"]["nees_dof"]["joint"] is None
 
 
-def test_pictures_of_two_runs_of_one_name_lie_side_by_side(capsys, run_folder, tmp_path):
+def test_pictures_of_two_runs_of_one_name_lie_side_by_side(run_folder, tmp_path):
     run = read_run(run_folder)
     write_run(tmp_path / "b" / "hall", run.log, truth=run.truth)
-    code, _, _ = _main(capsys, "evaluate", run_folder, tmp_path / "b" / "hall", "--plots", tmp_path / "pictures")
+    code, _, _ = gpvo("evaluate", run_folder, tmp_path / "b" / "hall", "--plots", tmp_path / "pictures")
     assert code == 0
     drawn = {p.name for p in (tmp_path / "pictures").glob("*_trajectory.png")}
     assert drawn == {"hall_trajectory.png", "hall-2_trajectory.png"}
@@ -263,21 +253,21 @@ def test_a_gap_in_the_truth_is_no_frame():
     assert found.rpe_second.translation_m.max <= whole.rpe_second.translation_m.max
 
 
-def test_truth_from_a_file_takes_the_noise_that_it_is_given(capsys, run_folder, tmp_path):
+def test_truth_from_a_file_takes_the_noise_that_it_is_given(run_folder, tmp_path):
     run = read_run(run_folder)
     write_tum(tmp_path / "truth.tum", run.truth.t_ns, run.truth.T_world_cam)
     args = ("evaluate", run_folder, "--truth", tmp_path / "truth.tum")
-    assert "+truth" not in _main(capsys, *args)[1]
-    assert "10 mm" in _main(capsys, *args, "--truth-sigma", "0.01")[1]
+    assert "+truth" not in gpvo(*args)[1]
+    assert "10 mm" in gpvo(*args, "--truth-sigma", "0.01")[1]
 
 
-def test_the_model_file_gives_constant_and_the_thesis_row(capsys, tmp_path):
+def test_the_model_file_gives_constant_and_the_thesis_row(tmp_path):
     """The thesis' row of a model read from its file is that of the fit in memory; other files have none."""
     trained = small_model()
     save_model(trained, tmp_path / "m.gpvo")
     log, truth = synthetic_run(50, n=200)
     write_run(tmp_path / "flight", log, truth=truth)
-    code, out, _ = _main(capsys, "evaluate", tmp_path / "flight", "--model", tmp_path / "m.gpvo", "--json")
+    code, out, _ = gpvo("evaluate", tmp_path / "flight", "--model", tmp_path / "m.gpvo", "--json")
     assert code == 0
     methods = json.loads(out)["runs"][0]["methods"]
     held_out = build(log, truth, name="flight")
@@ -298,10 +288,10 @@ def test_the_model_file_gives_constant_and_the_thesis_row(capsys, tmp_path):
         Predictor(trained.arrays, {**trained.header, "model_schema": 2})
 
 
-def test_a_model_of_windows_is_refused_by_name(capsys, run_folder, tmp_path):
+def test_a_model_of_windows_is_refused_by_name(run_folder, tmp_path):
     trained, model = small_model(), tmp_path / "windows.gpvo"
     modelfile.save(model, trained.arrays, {**trained.header, "target": "window:1s"})
-    _assert_refused(capsys, run_folder, "--model", model, says="windows.gpvo: this model predicts the error over")
+    _assert_refused(run_folder, "--model", model, says="windows.gpvo: this model predicts the error over")
 
 
 def test_constant_is_said_of_one_frame():
@@ -313,40 +303,40 @@ def test_constant_is_said_of_one_frame():
     np.testing.assert_allclose(constant.covariance[23], one)
 
 
-def test_a_run_that_states_nothing_of_motions_is_told_with_the_files_for_score(capsys, tmp_path: Path) -> None:
+def test_a_run_that_states_nothing_of_motions_is_told_with_the_files_for_score(tmp_path: Path) -> None:
     """Its covariances are of poses, as a filter's with a map; the folder would be refused by ``gpvo score``."""
     log, truth = make_run(60, v_t=False)
     log = VoLog([replace(r, covariances={IMPORTED_POSE: stated_covariance()}) for r in log])
     write_run(tmp_path / "slam", log, truth=truth, meta={"source": "made"})
-    code, _, err = _main(capsys, "evaluate", tmp_path / "slam", "--stated", tmp_path / "stated")
+    code, _, err = gpvo("evaluate", tmp_path / "slam", "--stated", tmp_path / "stated")
     assert code == 0
     assert "slam states no covariance of single motions" in err
     assert [p.name for p in (tmp_path / "stated").iterdir()] == ["truth"]
 
 
-def test_a_report_replaces_an_earlier_one_and_nothing_else(capsys, run_folder, tmp_path):
+def test_a_report_replaces_an_earlier_one_and_nothing_else(run_folder, tmp_path):
     page = tmp_path / "report.html"
     page.write_text("<!doctype html><title>gpvo, as I see it</title>")
     before = page.read_bytes()
-    code, out, err = _main(capsys, "report", run_folder, "-o", page)
+    code, out, err = gpvo("report", run_folder, "-o", page)
     assert (code, out, page.read_bytes()) == (2, "", before)
     assert "report.html: is another file, not an earlier report" in err.splitlines()[0]
     page.unlink()
-    assert [_main(capsys, "report", run_folder, "-o", page)[0] for _ in range(2)] == [0, 0]
+    assert [gpvo("report", run_folder, "-o", page)[0] for _ in range(2)] == [0, 0]
 
 
-def test_the_offset_that_evaluate_advises_is_an_option_of_train(capsys, tmp_path):
+def test_the_offset_that_evaluate_advises_is_an_option_of_train(tmp_path):
     """Of a truth on another clock, with it, a model is that of the truth on the log's, to the bit."""
     late_s, models = 0.25, {}
     for k, by_s in enumerate((0.0, late_s)):
         log, truth = synthetic_run(4, n=300)
         truth = replace(truth, t_ns=truth.t_ns + round(by_s * 1e9))
         write_run(tmp_path / str(k) / "run", log, truth=truth)
-    advice = _main(capsys, "evaluate", tmp_path / "1" / "run")[1]
+    advice = gpvo("evaluate", tmp_path / "1" / "run")[1]
     assert "with --time-offset auto" in advice
     for name, run, offset in (("own", "0", "0"), ("late", "1", str(late_s)), ("auto", "1", "auto")):
         given = (tmp_path / run / "run", "--time-offset", offset, "-o", tmp_path / f"{name}.gpvo")
-        code, _, err = _main(capsys, "train", *given)
+        code, _, err = gpvo("train", *given)
         assert (code, "contradict" in err) == (0, False)
         models[name], header = modelfile.load(tmp_path / f"{name}.gpvo")
         assert header["config"].get("time_offset_s", 0.0) == {"own": 0.0, "late": late_s, "auto": None}[name]
@@ -358,28 +348,28 @@ def test_the_offset_that_evaluate_advises_is_an_option_of_train(capsys, tmp_path
     )
 
 
-def test_an_offset_that_nothing_tells_names_the_run(capsys, tmp_path):
+def test_an_offset_that_nothing_tells_names_the_run(tmp_path):
     log, truth = synthetic_run(4, n=40)
     write_run(tmp_path / "short", log, truth=truth)
     for command in (["evaluate"], ["train", "-o", tmp_path / "m.gpvo"]):
-        code, out, err = _main(capsys, *command, tmp_path / "short", "--time-offset", "auto")
+        code, out, err = gpvo(*command, tmp_path / "short", "--time-offset", "auto")
         assert (code, out, len(err.splitlines())) == (2, "", 1)
         assert "short: the log lasts 2.00 s" in err
 
 
 @pytest.mark.parametrize("lost", [False, True], ids=["short", "lost throughout"])
-def test_what_no_run_so_short_or_lost_can_tell_is_said_of_it(capsys, tmp_path, lost):
+def test_what_no_run_so_short_or_lost_can_tell_is_said_of_it(tmp_path, lost):
     log, truth = make_run(200 if lost else 12, lost=set(range(1, 201)) if lost else set())
     write_run(tmp_path / "run", log, truth=truth)
-    code, out, err = _main(capsys, "train", tmp_path / "run", "-o", tmp_path / "m.gpvo")
+    code, out, err = gpvo("train", tmp_path / "run", "-o", tmp_path / "m.gpvo")
     assert (code, out, len(err.splitlines())) == (2, "", 1)
     of = "0 of 200" if lost else "12 of 12"
     assert f"run: only {of} motions were measured, 30 are needed (give a longer sequence" in err
     save_model(small_model(), tmp_path / "m.gpvo")
-    code, out, _ = _main(capsys, "predict", tmp_path / "m.gpvo", tmp_path / "run", "-o", tmp_path / "p.parquet")
+    code, out, _ = gpvo("predict", tmp_path / "m.gpvo", tmp_path / "run", "-o", tmp_path / "p.parquet")
     assert (code, "nan" in out, "no motion was measured" in out) == (0, False, lost)
-    code, out, err = _main(capsys, "calibration", tmp_path / "run")
+    code, out, err = gpvo("calibration", tmp_path / "run")
     assert (code, out, len(err.splitlines())) == (2, "", 1)
     assert "run: holds no calibration state (gpvo run estimates one" in err
-    code, out, err = _main(capsys, "score", tmp_path / "none")
+    code, out, err = gpvo("score", tmp_path / "none")
     assert (code, out, err) == (2, "", f"gpvo: {tmp_path / 'none'}: no such file or folder\n")

@@ -6,7 +6,6 @@ import json
 
 import numpy as np
 import pytest
-from gpvo import cli
 from gpvo.errors import ModelError
 from gpvo.evaluation.forecast import Plan, forecast, resample
 from gpvo.geometry import se3
@@ -17,6 +16,8 @@ from gpvo.online import modelfile
 from gpvo.online.predictor import Predictor
 from small_model import small_model
 from synthetic_runs import make_run
+
+from command_line import gpvo
 
 
 def truth_plan(seed: int, n: int = 200) -> Plan:
@@ -34,15 +35,6 @@ def model_file(tmp_path_factory):
     path = tmp_path_factory.mktemp("model") / "m.gpvo"
     save_model(small_model(), path)
     return path
-
-
-def _main(capsys, *args: object) -> tuple[int, str, str]:
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr("sys.argv", ["gpvo", "forecast", *map(str, args)])
-        with pytest.raises(SystemExit) as stop:
-            cli.main()
-    out, err = capsys.readouterr()
-    return int(stop.value.code or 0), out, err
 
 
 def test_final_sigma_is_that_of_flights_along_the_plan():
@@ -98,7 +90,7 @@ def test_motions_over_several_frames_are_planned_as_such():
     assert 0.5 < two / one < 0.9
 
 
-def test_document_table_picture_and_frames(capsys, tmp_path, model_file):
+def test_document_table_picture_and_frames(tmp_path, model_file):
     import pyarrow.csv
     import pyarrow.parquet
 
@@ -108,7 +100,7 @@ def test_document_table_picture_and_frames(capsys, tmp_path, model_file):
     write_tum(tmp_path / "body.tum", t_ns, plan.T_world_cam @ se3.from_rt(R_FLU_OPTICAL.T, np.zeros(3)))
     found = {}
     for frame in ("cam", "body"):
-        code, out, _ = _main(capsys, model_file, "--path", tmp_path / f"{frame}.tum", "--frame", frame, "--json")
+        code, out, _ = gpvo("forecast", model_file, "--path", tmp_path / f"{frame}.tum", "--frame", frame, "--json")
         assert code == 0
         found[frame] = json.loads(out)
     assert found["cam"]["final_sigma_m"] == pytest.approx(found["body"]["final_sigma_m"], rel=1e-5)
@@ -119,7 +111,7 @@ def test_document_table_picture_and_frames(capsys, tmp_path, model_file):
     picture = tmp_path / "plan.png"
     for name in ("all.csv", "all.parquet"):
         args = ("--plot", picture, "-o", tmp_path / name)
-        code, out, _ = _main(capsys, model_file, "--path", tmp_path / "cam.tum", *args)
+        code, out, _ = gpvo("forecast", model_file, "--path", tmp_path / "cam.tum", *args)
         assert code == 0
         assert "% of the plan lies outside the training domain" in out
         assert "axes of the plan's world" in out
@@ -129,37 +121,37 @@ def test_document_table_picture_and_frames(capsys, tmp_path, model_file):
         assert table["sigma_m"][60].as_py() == pytest.approx(document["predicted_final_error_m"], rel=1e-9)
     assert picture.read_bytes().startswith(b"\x89PNG")
     picture = tmp_path / "pictures" / "plan.pdf"
-    assert _main(capsys, model_file, "--path", tmp_path / "cam.tum", "--plot", picture)[0] == 0
+    assert gpvo("forecast", model_file, "--path", tmp_path / "cam.tum", "--plot", picture)[0] == 0
     assert picture.read_bytes().startswith(b"%PDF")
     assert not list(tmp_path.glob("*.part"))
 
 
 @pytest.mark.parametrize(("option", "name"), [("--plot", "p.png"), ("--plot", "p.pdf"), ("--plot", "p.svg"),
                                               ("-o", "p.csv"), ("-o", "p.parquet")])  # fmt: skip
-def test_a_forecast_replaces_an_earlier_one_and_nothing_else(capsys, tmp_path, model_file, option, name):
+def test_a_forecast_replaces_an_earlier_one_and_nothing_else(tmp_path, model_file, option, name):
     plan, foreign = truth_plan(7, n=60), b"\x89PNG of somebody, or t_s,distance_m by hand"
     write_tum(tmp_path / "cam.tum", np.round(plan.t_s * 1e9).astype(np.int64), plan.T_world_cam)
     given = (model_file, "--path", tmp_path / "cam.tum", option, tmp_path / name)
     (tmp_path / name).write_bytes(foreign)
-    code, out, err = _main(capsys, *given)
+    code, out, err = gpvo("forecast", *given)
     assert (code, out, len(err.splitlines())) == (2, "", 1)
     assert f"{name}: is another file, not an earlier" in err
     assert (tmp_path / name).read_bytes() == foreign
     (tmp_path / name).unlink()
-    assert [_main(capsys, *given)[0] for _ in range(2)] == [0, 0]
+    assert [gpvo("forecast", *given)[0] for _ in range(2)] == [0, 0]
     assert (tmp_path / name).read_bytes() != foreign
 
 
-def test_a_plot_never_replaces_the_plan(capsys, tmp_path, model_file):
+def test_a_plot_never_replaces_the_plan(tmp_path, model_file):
     plan = truth_plan(7, n=60)
     write_tum(tmp_path / "cam.tum", np.round(plan.t_s * 1e9).astype(np.int64), plan.T_world_cam)
     before = (tmp_path / "cam.tum").read_bytes()
-    code, _, err = _main(capsys, model_file, "--path", tmp_path / "cam.tum", "--plot", tmp_path / "cam.tum")
+    code, _, err = gpvo("forecast", model_file, "--path", tmp_path / "cam.tum", "--plot", tmp_path / "cam.tum")
     assert (code, (tmp_path / "cam.tum").read_bytes()) == (2, before)
     assert "does not have the suffix of an image" in err
 
 
-def test_what_cannot_be_forecast_is_one_line(capsys, tmp_path, model_file):
+def test_what_cannot_be_forecast_is_one_line(tmp_path, model_file):
     write_tum(tmp_path / "short.tum", np.array([0, 60_000_000]), np.stack([np.eye(4)] * 2))
     write_tum(tmp_path / "plan.tum", np.array([0, 10**9]), np.stack([np.eye(4)] * 2))
     cases = [
@@ -171,7 +163,7 @@ def test_what_cannot_be_forecast_is_one_line(capsys, tmp_path, model_file):
         (("--path", tmp_path / "none.tum", "--plot", tmp_path / "x.txt"), "not have the suffix of an image"),
     ]
     for args, says in cases:
-        code, out, err = _main(capsys, model_file, *args)
+        code, out, err = gpvo("forecast", model_file, *args)
         assert (code, out) == (2, "")
         assert len(err.strip().splitlines()) == 1
         assert says in err
@@ -185,10 +177,10 @@ def test_what_cannot_be_forecast_is_one_line(capsys, tmp_path, model_file):
         forecast(predictor, truth_plan(7, n=60))
 
 
-def test_a_model_of_windows_is_refused_by_name(capsys, tmp_path):
+def test_a_model_of_windows_is_refused_by_name(tmp_path):
     predictor = small_model().predictor()
     modelfile.save(tmp_path / "windows.gpvo", predictor.arrays, {**predictor.header, "target": "window:1s"})
-    code, _, err = _main(capsys, tmp_path / "windows.gpvo", "--path", tmp_path / "plan.tum")
+    code, _, err = gpvo("forecast", tmp_path / "windows.gpvo", "--path", tmp_path / "plan.tum")
     assert code == 2
     assert "windows.gpvo: this model predicts the error over window:1s" in err
 

@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 from gpvo.errors import GpvoError
 from gpvo.evaluation.flights import flight_of
+from gpvo.filters.imu_motion import clock_shift
 from gpvo.filters.policies import LearnedPolicy
 from gpvo.filters.run import Flight, fuse_flight
 from gpvo.filters.sanity import check_flight, require_sane
@@ -229,3 +230,16 @@ def test_frames_beyond_the_imu_are_left_out_and_a_bad_sample_spoils_nothing(flig
     assert run.t_ns[-1] <= half.t_ns[-1] + 100_000_000
     assert run.scores is not None
     assert run.scores.ate_rmse_m < 0.1
+
+
+@pytest.mark.parametrize("late_s", [0.06, -0.1, 0.0])
+def test_the_shift_of_a_clock_is_found_where_the_vehicle_turns(late_s: float) -> None:
+    flight = synthetic_flight(2, duration_s=20)
+    assert flight.imu is not None
+    shifted = replace(flight.imu, t_ns=flight.imu.t_ns + round(late_s * 1e9))
+    found = clock_shift(flight, shifted)
+    assert (found is None) == (late_s == 0.0)
+    assert found is None or found.shift_s == pytest.approx(late_s, abs=0.01)
+    # Of a vehicle that hardly turns nothing is told.
+    straight = [replace(r, T_prev_cur=se3.from_rt(np.eye(3), r.T_prev_cur[:3, 3])) for r in flight.records]
+    assert clock_shift(replace(flight, records=straight), shifted) is None

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import bisect
 from dataclasses import replace
 
 import numpy as np
@@ -9,8 +10,9 @@ import pytest
 from gpvo.filters import metrics
 from gpvo.filters.eskf import ErrorStateFilter
 from gpvo.filters.measurement import BIAS, JOINT, THREE_SIGMA, Gate, chi2_cdf, chi2_quantile
+from gpvo.filters.plausible import Samples
 from gpvo.filters.policies import LearnedPolicy
-from gpvo.filters.propagation import BA, P
+from gpvo.filters.propagation import BA, TH, P, V
 from gpvo.filters.run import Flight, FuseOptions, begin, fuse_flight, make_filter
 from gpvo.filters.timeline import Timeline
 from gpvo.geometry import se3
@@ -279,6 +281,48 @@ def test_where_no_motion_tells_whether_time_has_passed_the_filter_doubts_it(ahea
         timeline.add_vo(replace(r, t_ns=r.t_ns + ahead_ns, status=Status.LOST))
         nees.append(_position_nees(timeline, flight, 60))
     assert 0.1 < np.mean(nees) < 2.0
+
+
+def test_of_a_silence_anything_may_be_that_a_vehicle_does() -> None:
+    """It has gone on as fast as before or stopped, and turned by a radian about the vertical, little about others."""
+    flight = synthetic_flight(3, duration_s=2)
+    filter = _timeline(flight).filter
+    filter.x.velocity[:] = [3.0, 0.0, 4.0]
+    filter.x.R_world_imu[:] = R = se3.so3_exp(np.array([0.4, -0.2, 1.0]))
+    before = filter.covariance.copy()
+    filter.lose_track(0.5)
+    added = (filter.covariance - before)[0]
+    in_world = R @ added[TH, TH] @ R.T
+    np.testing.assert_allclose(in_world, np.diag([0.2**2, 0.2**2, 1.0]), atol=1e-12)
+    np.testing.assert_allclose(added[P, P], 2.5**2 * np.eye(3), atol=1e-12)
+    np.testing.assert_allclose(added[V, V], 5.0**2 * np.eye(3), atol=1e-12)
+    filter.x.velocity[:] = 0.1
+    before = filter.covariance.copy()
+    filter.lose_track(0.5)
+    np.testing.assert_allclose((filter.covariance - before)[0, V, V], np.eye(3), atol=1e-12)
+
+
+def test_a_bias_that_forgets_is_as_unsure_in_the_end_as_before_it_was_measured() -> None:
+    filter = _timeline(synthetic_flight(3, duration_s=2)).filter
+    A = np.random.default_rng(0).standard_normal((JOINT, JOINT))
+    filter.P[:] = A @ A.T
+    tau_s = np.array([0.5, 1.0, 2.0, 4.0, 8.0, np.inf])
+    before, phi = filter.P[0].copy(), np.append(np.exp(-0.7 / tau_s), np.ones(6))
+    filter.decay_bias(0.7, tau_s)
+    np.testing.assert_allclose(filter.P[0, BIAS, BIAS], np.outer(phi, phi) * before[BIAS, BIAS] + np.diag(1 - phi**2))
+    np.testing.assert_allclose(filter.P[0, :15, BIAS], before[:15, BIAS] * phi)
+    filter.decay_bias(1e6, tau_s)
+    np.testing.assert_allclose(filter.P[0, BIAS, BIAS][:5, :5], np.eye(5), atol=1e-12)
+
+
+def test_a_reading_between_two_samples_lies_on_the_line_between_them() -> None:
+    """Frames need not fall on samples; beyond the ends, the last one holds."""
+    samples, slope = Samples(), np.arange(1.0, 7.0)
+    for t_ns in (30, 10, 20, 45):
+        samples.insert(t_ns, slope * t_ns)
+    for t_ns, expected_ns in ((5, 10), (10, 10), (13, 13), (20, 20), (41, 41), (45, 45), (60, 45)):
+        found = samples.at(t_ns, bisect.bisect_right(samples.t_ns, t_ns))
+        np.testing.assert_allclose(found, slope * expected_ns, rtol=1e-12)
 
 
 @pytest.mark.parametrize("n", [3, 10])

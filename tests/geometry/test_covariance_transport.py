@@ -65,6 +65,22 @@ def test_accumulate_is_repeated_compounding_and_follows_parents():
 
 
 @pytest.mark.parametrize(
+    ("twist", "sigma_m", "sigma_rad"),
+    [
+        (None, 3.0, 0.1),  # no motion yet: 15 m/s
+        (np.zeros(6), 0.2, 0.1),
+        (np.array([0.4, 0.0, 0.3, 0.0, 0.3, 0.0]), 0.2, 0.1),
+        (np.array([3.0, 0.0, 4.0, 0.6, 0.0, 0.8]), 1.0, 0.2),
+    ],
+)
+def test_a_motion_that_was_not_measured_is_as_large_as_the_last_one_or_a_start(twist, sigma_m, sigma_rad):
+    variances = np.square(np.repeat([sigma_m, sigma_rad], 3))
+    np.testing.assert_allclose(cov.lost_covariance(0.2, twist), np.diag(variances))
+    # However short, it is no motion that is known: a millimetre, a milliradian.
+    np.testing.assert_allclose(cov.lost_covariance(0.2e-6, twist), 1e-6 * np.eye(6))
+
+
+@pytest.mark.parametrize(
     ("C", "expected"),
     [
         (np.eye(6), True),

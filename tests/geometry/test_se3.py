@@ -88,6 +88,17 @@ def test_mirror_images_and_transposed_poses_are_not_rigid(wrong):
     assert not se3.is_rigid(wrong, 100.0)
 
 
+@pytest.mark.parametrize("at", [(0, 0), (1, 1), (2, 2), (0, 1), (0, 2), (1, 2)])
+def test_what_is_stretched_or_sheared_along_one_axis_is_not_rigid(at):
+    bent = np.eye(4)
+    bent[at] += 5e-3
+    slightly = np.eye(4)
+    slightly[at] += 1e-4
+    for T in POSES:
+        assert not se3.is_rigid(T @ bent, 100.0)
+        assert se3.is_rigid(T @ slightly, 100.0)
+
+
 def test_transform_moves_points():
     points = np.random.default_rng(5).normal(size=(7, 3))
     expected = (POSES[0] @ np.column_stack([points, np.ones(7)]).T).T[:, :3]

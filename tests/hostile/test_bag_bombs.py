@@ -29,10 +29,11 @@ from rosbags.typesys import Stores, get_typestore
 def test_a_chunk_unpacks_to_what_it_declares_and_no_further(new: Callable[[], Any]) -> None:
     pack = {bz2.BZ2Decompressor: bz2.compress, LZ4FrameDecompressor: lz4_compress}.get(new, zstd.compress)
     some, large = np.random.default_rng(0).bytes(9_000_000), pack(bytes(300_000_000))
-    assert unpacked(pack(some), new=new) == unpacked(pack(some), len(some), new=new) == some
+    packed = pack(some)
+    assert unpacked(packed, new=new) == unpacked(packed, len(some), new=new) == some
     assert unpacked(pack(b""), new=new) == b""
     with pytest.raises(EOFError):
-        unpacked(pack(some)[:-20], new=new)
+        unpacked(packed[:-20], new=new)
     before = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
     for declared, most in ((1000, 1000), (1 << 62, 1 << 28)):
         with pytest.raises(TooLarge, match=f"more than {most} bytes"):

@@ -73,6 +73,7 @@ ARRAYS: dict[str, tuple[str, Callable[[np.ndarray], np.ndarray]]] = {
     "negative correlation": ("correlation", _full(-5.0)),
     "indefinite correlation": ("correlation", lambda a: np.where(np.eye(6) > 0, 1.0, 0.99 * np.sign(np.sin(7.0 * a)))),
     "skew correlation": ("correlation", lambda a: np.triu(a)),
+    "a covariance for a correlation": ("correlation", lambda a: 2.0 * a),
     "weight above one": ("geometry_weight", _full(10.0)),
     "growth not a number": ("growth", _full(np.nan)),
     "huge growth": ("growth", _full(1e4)),

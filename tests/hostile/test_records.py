@@ -93,10 +93,16 @@ def test_any_row_is_answered_with_a_positive_definite_covariance(value: float, d
 
 
 @pytest.mark.parametrize("geometry", [3.0 * np.ones((6, 6)), np.diag([1.0, 1, 1, 1, 1, -1]), np.full((6, 6), np.inf)])
-def test_an_impossible_geometry_is_left_out(geometry: np.ndarray, predictor) -> None:
+def test_an_impossible_geometry_is_left_out(geometry: np.ndarray) -> None:
+    predictor = Predictor.load(TUNNEL)  # which believes the geometry, as a model of few flights does not
     np.fill_diagonal(geometry, np.where(np.diagonal(geometry) == 3.0, 1.0, np.diagonal(geometry)))
-    x = predictor.model.domain.centre
-    np.testing.assert_array_equal(predictor.predict(x, geometry).covariance, predictor.predict(x).covariance)
+    x, possible = predictor.model.domain.centre, np.full((6, 6), 0.9) + 0.1 * np.eye(6)
+    alone = predictor.predict(x).covariance
+    np.testing.assert_array_equal(predictor.predict(x, geometry).covariance, alone)
+    assert np.abs(predictor.predict(x, possible).covariance / alone - 1.0).max() > 0.1
+    # Beside a possible one, too, of which nothing changes.
+    both = predictor.predict(np.stack([x, x]), np.stack([geometry, possible])).covariance
+    np.testing.assert_allclose(both, [alone, predictor.predict(x, possible).covariance], rtol=1e-12)
 
 
 def test_a_row_without_its_inputs_is_no_surer_than_the_worst_of_training(predictor) -> None:

@@ -23,6 +23,8 @@ from gpvo.online.predictor import Predictor
 from gpvo.types import VoLog
 from synthetic_runs import make_run
 
+from command_line import gpvo
+
 MODEL = Path(__file__).parents[2] / "models" / "tunnel.gpvo"
 ESC = "\x1b[2J\x1b]0;owned\x07"
 
@@ -36,11 +38,6 @@ def log() -> VoLog:
 def run(log: VoLog, tmp_path: Path) -> Path:
     write_run(tmp_path / "run", log)
     return tmp_path / "run"
-
-
-def gpvo(*words: object, cwd: Path | None = None) -> subprocess.CompletedProcess[str]:
-    call = [sys.executable, "-m", "gpvo", *map(str, words)]
-    return subprocess.run(call, capture_output=True, text=True, cwd=cwd, timeout=120)
 
 
 def bytes_of(folder: Path) -> dict[str, bytes]:
@@ -227,7 +224,7 @@ def test_nothing_of_a_file_reaches_the_terminal_as_a_command(log: VoLog, tmp_pat
     write_run(tmp_path / "run", log, meta={"name": name, "source": name})
     assert read_run(tmp_path / "run").name.isprintable()
     for words in (("info", "run"), ("info", "est.csv"), ("evaluate", "run"), ("info", f"no{ESC}such")):
-        done = gpvo(*words, cwd=tmp_path)
+        done = gpvo(*words, folder=tmp_path)
         assert "\x1b" not in done.stdout + done.stderr, words
     assert "\x1b" not in str(GpvoError(f"no such '{ESC}'", where=name))
 
@@ -244,7 +241,7 @@ def test_names_inside_a_bag_reach_neither_terminal_nor_run_raw(tmp_path: Path) -
         maker.messages[-1][2].child_frame_id = f"base{ESC}"
     maker.write(tmp_path / "evil.bag")
     for words in (("info", "evil.bag"), ("doctor", "evil.bag"), ("run", "evil.bag", "-o", "run")):
-        done = gpvo(*words, cwd=tmp_path)
+        done = gpvo(*words, folder=tmp_path)
         assert done.returncode == 0, done.stderr
         assert "odom" in done.stdout + done.stderr
         assert "\x1b" not in done.stdout + done.stderr, words
@@ -260,7 +257,7 @@ def test_a_warning_reaches_the_terminal_as_text() -> None:
 
 
 def test_a_file_named_to_fool_the_terminal_is_refused(tmp_path: Path) -> None:
-    done = gpvo("run", f"a{ESC}.npz", "-o", "x", cwd=tmp_path)
+    done = gpvo("run", f"a{ESC}.npz", "-o", "x", folder=tmp_path)
     assert done.returncode == 2
     assert "a control character in an argument" in done.stderr
     assert "\x1b" not in done.stderr

@@ -56,6 +56,12 @@ def _of_three() -> TrainedModel:
     return train_sets(training_sets(range(3), n=120), QUICK)
 
 
+@cache
+def _of_twelve() -> list[TrainingSet]:
+    """Longer flights, whose scale is right."""
+    return training_sets(range(12), n=600)
+
+
 def _said(predictor, s):
     return predictor.predict(s.select(predictor.features), s.covariances.get("pointing_matching"), s.dt_s)
 
@@ -350,7 +356,7 @@ def test_an_update_keeps_the_settings_of_the_model_and_reads_each_run_once(tmp_p
 )
 def test_a_truth_that_contradicts_odometry_is_named_before_a_model_learns_from_it(tmp_path, twin):
     path, runs = tmp_path / "m.gpvo", [tmp_path / "flight8", tmp_path / "flight9"]
-    save_model(train_sets(training_sets(range(3), n=120), QUICK, judge=False), path)
+    save_model(_of_three(), path)
     for run_path, is_conjugate in zip(runs, (False, True), strict=True):
         log, truth = make_run(9)
         T = np.array(truth.T_world_cam)
@@ -575,7 +581,7 @@ def test_a_covariance_that_is_always_the_same_is_compared_but_says_nothing():
 def test_a_wrong_scale_is_a_part_of_its_own(tmp_path):
     """Forward motions are too long, or too short, all flight, by more than all else is wrong by; they turn around."""
     rng = np.random.default_rng(0)
-    sets, plain = [], training_sets(range(12), n=600)
+    sets, plain = [], _of_twelve()
     for s in plain:
         v = np.where(np.arange(len(s)) // 80 % 2 == 0, 1.0, -1.0) * rng.uniform(0.5, 1.0)
         X, Y = s.X.copy(), s.Y.copy()
@@ -595,7 +601,7 @@ def test_a_wrong_scale_is_a_part_of_its_own(tmp_path):
 
 
 def test_without_a_wrong_scale_there_is_no_such_part():
-    trained = train_sets(training_sets(range(12), n=600), QUICK, judge=False)
+    trained = train_sets(_of_twelve(), QUICK, judge=False)
     assert trained.header["calibration"]["calibration_part"] is False
     assert not trained.arrays["calibration_patterns"].any()
 

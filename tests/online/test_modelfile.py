@@ -137,6 +137,12 @@ def test_numbers_that_are_not_json_are_refused(model: Path) -> None:
         modelfile.load(model)
 
 
+def test_units_that_are_not_those_of_the_features_are_refused(model: Path) -> None:
+    modelfile.save(model, some_arrays(), {**HEADER, "units": ["m/s"]})
+    with pytest.raises(ModelError, match=r"model\.gpvo: its header names 1 units for 2 features"):
+        modelfile.load(model)
+
+
 def test_other_metadata_is_refused(model: Path) -> None:
     rewrite(model, lambda tensors, document: document.update(kind="something else"))
     with pytest.raises(ModelError, match="not a gpvo model"):

@@ -19,12 +19,14 @@ from gpvo.geometry import se3
 from gpvo.geometry.covariance import is_positive_definite
 from gpvo.online import modelfile
 from gpvo.online.division import divide, ln_faster
-from gpvo.online.guard import AdaptiveScale
+from gpvo.online.guard import DEGRADED_BELOW, AdaptiveScale
 from gpvo.online.observer import Observer, joined
 from gpvo.online.predictor import Predictor
 from gpvo.types import MotionError, Status, VoLog
 from small_model import small_model, training_sets
 from synthetic_runs import CAMERA, make_run
+
+TUNNEL = Path(__file__).parents[2] / "models" / "tunnel.gpvo"
 
 
 @pytest.fixture
@@ -58,6 +60,21 @@ def test_confidence_is_the_same_in_flight_and_for_rows_of_features(predictor, fl
     assert said.confidence == pytest.approx(alone.confidence, rel=1e-9)
 
 
+def test_a_motion_that_takes_longer_errs_by_more(predictor):
+    """Each row by its own duration; without one, by that of the training."""
+    for one in (predictor, Predictor.load(TUNNEL)):
+        x, dt_s = one.model.domain.centre, float(one.model.dt_s)
+        durations = np.array([0.5, 1.0, 3.0]) * dt_s
+        many = one.predict(np.tile(x, (3, 1)), dt_s=durations)
+        for k, duration_s in enumerate(durations):
+            np.testing.assert_allclose(many.covariance[k], one.predict(x, dt_s=duration_s).covariance, rtol=1e-12)
+        np.testing.assert_allclose(many.covariance[1], one.predict(x).covariance, rtol=1e-12)
+        np.testing.assert_allclose(many.dt_s, durations)
+        trace = np.trace(many.covariance, axis1=1, axis2=2)
+        assert trace[0] <= trace[1] <= trace[2]
+    assert trace[1] < 0.9 * trace[2]
+
+
 def test_parts_sum_to_the_covariance(predictor, flight):
     for record in flight[0]:
         p = predictor.step(record)
@@ -66,6 +83,18 @@ def test_parts_sum_to_the_covariance(predictor, flight):
         assert 0 <= p.confidence <= 1
         assert 0 <= p.in_domain <= 1
         assert (p.epistemic <= np.diagonal(p.covariance) * (1 + 1e-9)).all()
+
+
+def test_what_lies_outside_the_domain_is_degraded_and_nothing_else(predictor, flight):
+    told = []
+    for k, record in enumerate(flight[0].records[1:60]):
+        given = replace(record, n_inliers=10**6) if k % 7 == 5 else record
+        given = replace(given, status=Status.DEGRADED) if k % 5 == 3 else given
+        said = predictor.step(given)
+        outside = said.in_domain < DEGRADED_BELOW
+        assert said.status is (Status.DEGRADED if outside else given.status), k
+        told.append((outside, given.status))
+    assert set(told) == {(far, status) for far in (False, True) for status in (Status.OK, Status.DEGRADED)}
 
 
 def test_covariance_grows_with_the_distance_from_the_training_data(predictor, flight):
@@ -247,8 +276,10 @@ def test_explanation_names_the_input_that_changed(predictor, flight):
     for record in flight[0].records[:30]:
         predictor.step(record)
     few = replace(flight[0].records[30], n_inliers=3, covariances={"pointing_matching": np.eye(6)})
+    before = predictor.explain(few)  # also what is not predicted yet
     predictor.step(few)
-    first = predictor.explain(few)[0]
+    assert before == predictor.explain(few) == predictor.explain()
+    first = before[0]
     assert first.feature.startswith(("ln_var", "n_inliers"))
     assert "sigma" in str(first)
 

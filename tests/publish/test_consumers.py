@@ -113,6 +113,9 @@ def test_check_of_the_others(odometry: list[Odometry]) -> None:
     assert all(v.hidden_percent == 0 for v in consumers.check(odometry, "robot_localization"))
     lifted = [replace(o, twist_covariance=lift(np.eye(6) * 1e-12, 1e-9)) for o in odometry]
     assert [v.hidden_percent for v in consumers.check(lifted, "robot_localization")] == [100.0, 0.0]
+    for axis in range(6):  # it floors each of them
+        one = [replace(o, twist_covariance=np.diag(np.where(np.arange(6) == axis, 1e-12, 1.0))) for o in odometry]
+        assert [v.hidden_percent for v in consumers.check(one, "robot_localization")] == [100.0, 0.0]
     with pytest.raises(GpvoError, match="unknown consumer"):
         consumers.check(odometry, "betaflight")
 

@@ -75,6 +75,17 @@ def test_the_source_of_the_covariance_is_told(predicted: Path, tmp_path: Path) -
     assert publish_run(other, replace(settings, out=tmp_path / "other")).source == "pointing_matching"
 
 
+@pytest.mark.parametrize(("rate_hz", "told_hz"), [(20.0, 30.0), (50.0, 50.0)])
+def test_a_filter_beside_the_bag_runs_no_slower_than_the_odometry(
+    tmp_path: Path, rate_hz: float, told_hz: float
+) -> None:
+    log, truth = make_run(61, n=20, rate_hz=rate_hz)
+    write_run(tmp_path / "run", log, truth=truth, meta={"source": "made"})
+    publish_run(tmp_path / "run", replace(GEOMETRY, out=tmp_path / "out.mcap"))
+    text = (tmp_path / "out_robot_localization.yaml").read_text()
+    assert f"frequency: {told_hz:.1f}" in text
+
+
 @pytest.mark.parametrize(
     "to, name, words",
     [

@@ -123,6 +123,30 @@ def test_after_a_break_the_twist_is_that_of_the_motion_alone() -> None:
     assert after.reset_counter == 1
 
 
+def test_the_twist_between_two_motions_from_one_reference_is_as_wrong_as_drawn_ones() -> None:
+    """The reference's noise is in both and cancels; what remains is that of either end, and of either motion alone."""
+    rng, n, dt = np.random.default_rng(6), 20_000, 0.1
+    J, W = _spd(rng, 1e-3), _spd(rng, 5e-4)
+    motions = [se3.exp(k * np.array([0.3, 0.02, 0.1, 0.05, -0.1, 0.2])) for k in (1, 2)]
+
+    def draw(C: np.ndarray) -> np.ndarray:
+        return se3.exp(rng.standard_normal((n, 6)) @ np.linalg.cholesky(C).T)
+
+    start = se3.inverse(draw(0.5 * J))
+    one, two = (start @ T @ draw(0.5 * J) @ draw(W) for T in motions)
+    drawn = se3.log(se3.inverse(one) @ two) @ se3.adjoint(MOUNT).T / dt
+    builder = OdometryBuilder(MOUNT, floor=TINY)
+    builder.step(VoRecord(0, 0, Status.START, np.eye(4)))
+    for k, T in enumerate(motions, 1):
+        record = VoRecord(k * 10**8, 0, Status.OK, T, is_reference=False)
+        out = builder.step(record, _prediction(k * 10**8, J, W, 0 * W))
+    sample, sigma = np.cov(drawn.T), drawn.std(axis=0)
+    # An entry of a sample covariance scatters by 1 % of its variances; 5 of that.
+    np.testing.assert_allclose(
+        out.twist_covariance / np.outer(sigma, sigma), sample / np.outer(sigma, sigma), atol=0.05
+    )
+
+
 def test_a_restart_of_the_source_is_one_reset() -> None:
     C, builder = 1e-6 * np.eye(6), OdometryBuilder(floor=TINY)
     builder.step(VoRecord(0, 0, Status.START, np.eye(4)))

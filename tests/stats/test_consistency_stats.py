@@ -13,6 +13,7 @@ from gpvo.stats.consistency import (
     crps_gaussian,
     energy_score,
     nees,
+    nees_by_block,
     nll_per_dim,
     seen_axes,
     whiten,
@@ -44,6 +45,16 @@ def test_nees_of_a_variance_too_small_by_four_is_four_times_larger():
     np.testing.assert_allclose(nees(e, C / 4), 4 * nees(e, C))
 
 
+def test_nees_is_told_of_the_blocks_that_the_errors_hold():
+    """Of translations alone there is no joint NEES; of the axes that count, only theirs."""
+    (e, C), count = _drawn(6), lambda *given: {name: values.mean() for name, values in nees_by_block(*given).items()}
+    whole = {"translation": pytest.approx(1.0, abs=0.03), "rotation": pytest.approx(1.0, abs=0.03)}
+    assert count(e, C) == {**whole, "joint": pytest.approx(1.0, abs=0.03)}
+    assert count(e[:, :3], C[:, :3, :3]) == {"translation": whole["translation"]}
+    np.testing.assert_allclose(nees_by_block(e, C, [1, 2])["joint"], nees(e[:, 1:3], C[:, 1:3, 1:3]) / 2)
+    assert nees_by_block(e, C, [1, 2]).keys() == {"translation", "joint"}
+
+
 @pytest.mark.parametrize(
     ("d", "shares"), [(1, (0.683, 0.954, 0.997)), (3, (0.20, 0.74, 0.97)), (6, (0.014, 0.32, 0.83))]
 )
@@ -56,7 +67,9 @@ def test_joint_ellipsoid_coverage(d, shares):
 def test_coverage_per_axis():
     e, C = _drawn(6)
     sigma = np.sqrt(np.diagonal(C, axis1=1, axis2=2))
-    np.testing.assert_allclose(coverage(e, sigma), [0.6827, 0.9545, 0.9973], atol=0.005)
+    shares = np.array([0.6827, 0.9545, 0.9973])
+    # Within five standard deviations of the share of errors that are drawn apart.
+    assert (np.abs(coverage(e, sigma) - shares) < 5 * np.sqrt(shares * (1 - shares) / N)).all()
     np.testing.assert_allclose(coverage(e, 10 * sigma, (1.0,)), [1.0], atol=1e-9)
 
 
