@@ -128,11 +128,11 @@ def report(
 
     Example: gpvo report runs/mh01 -o report.html
     """
-    from gpvo.evaluation.report import write_report
+    from gpvo.evaluation.report import PAGE, write_report
 
     if sequence is not None and frames is None:
         raise GpvoError("--sequence has no effect without --frames", cure="add --frames, such as 5,80")
-    refuse_foreign(out, b"<title>gpvo report</title>", "report")  # before the work, not after it
+    refuse_foreign(out, *PAGE)  # before the work, not after it
     found = _evaluate(runs, judge, unjudged=True)
     pictures = [] if frames is None else _pictures(runs, frames, sequence)
     with progress("pages", 1):
