@@ -113,7 +113,7 @@ def refuse_foreign(path: Path, mark: bytes, what: str) -> None:
     if not folder.is_dir() or not os.access(folder, os.W_OK | os.X_OK):
         reason = "may not be written to" if folder.is_dir() else "is no folder"
         raise OutputError(f"cannot be written: {folder} {reason}", where=path, cure="name a file in a writable folder")
-    if not mark or not path.is_file() or not path.stat().st_size:
+    if not mark or not path.is_file():
         return
     try:
         with path.open("rb") as file:
@@ -122,7 +122,7 @@ def refuse_foreign(path: Path, mark: bytes, what: str) -> None:
             ends += file.read()
     except OSError as error:
         raise OutputError(f"cannot be read: {error.strerror}", where=path) from None
-    if not re.search(mark, ends, re.DOTALL):
+    if ends.strip() and not re.search(mark, ends, re.DOTALL):
         raise OutputError(f"is another file, not an earlier {what}", where=path, cure="choose another name")
 
 
@@ -320,8 +320,8 @@ def write_csv(path: Path, columns: Mapping[str, Sequence[Any]]) -> None:
     writer.writerow(columns)
     plain = (c.tolist() if hasattr(c, "tolist") else c for c in columns.values())
     writer.writerows([None if v != v else v for v in row] for row in zip(*plain, strict=True))
-    own = (rb"\A" + re.escape(next(iter(columns), "").encode()) + rb"[,\n]", "table")
-    write_text(path, stream.getvalue(), own=own)
+    head = rb"\A" + re.escape(next(iter(columns), "").encode()) + rb"[,\n]"
+    write_text(path, stream.getvalue(), own=(head, "table") if columns else None)
 
 
 def columns_of(rows: Sequence[Mapping[str, Any]]) -> dict[str, list[Any]]:

@@ -115,7 +115,7 @@ def read_times(path: str | Path) -> Stamps:
     return np.array(stamps, dtype=np.int64)
 
 
-TUM = (rb"\A\d+\.\d{9}( -?\d+\.\d{9}){7}\n", "trajectory")  # as tum_line writes it
+TUM = (rb"\A-?\d+\.\d{9}( -?\d+\.\d{9}){7}\n", "trajectory")  # as tum_line writes it
 
 
 def write_tum(path: str | Path, t_ns: Stamps, T_world_body: Array) -> None:

@@ -75,7 +75,8 @@ def publish_run(path: Path, settings: PublishSettings) -> Published:
     _require(settings)
     run = read_run(path)
     if settings.to is not None and settings.link is None:
-        settings = replace(settings, out=settings.out or Path(_named(run, settings.to)))
+        name = f"{run.name}.tlog" if settings.to == "mavlink" else f"{run.name}_{settings.to}"
+        settings = replace(settings, out=settings.out or Path(name))
         _refuse_other(settings)  # before the work, not after it
     model = settings.model
     predictor = None if model is None else Predictor.load(model).require_motions(model)
@@ -142,10 +143,6 @@ def _check_stamps(run: Run, odometry: Sequence[Odometry], settings: PublishSetti
     if early or (settings.to != "mavlink" and last_ns >= END_OF_ROS_NS):
         when = "before 1970" if early else "after January 2038, where those of ROS end"
         raise GpvoError(f"has stamps {when}", where=run.path, cure="subtract an offset from the stamps of its source")
-
-
-def _named(run: Run, to: str) -> str:
-    return f"{run.name}.tlog" if to == "mavlink" else f"{run.name}_{to}"
 
 
 def _kind(settings: PublishSettings, out: Path) -> str:

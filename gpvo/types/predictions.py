@@ -12,7 +12,7 @@ from typing import Any, TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
-from gpvo.types.records import Columns, Status, VoLog, VoRecord
+from gpvo.types.records import Columns, Status, VoLog
 from gpvo.types.sensors import Array
 
 _SAME_S = 1e-6
@@ -114,10 +114,6 @@ class Prediction(MotionError):
     confidence: float | Array
     in_domain: float | Array
 
-    def is_of(self, record: VoRecord) -> bool:
-        """Whether it speaks of the record's own motion, not of a window of motions that ends there."""
-        return self.t_ns == record.t_ns and abs(float(self.dt_s) - record.dt_s) < _SAME_S
-
 
 @dataclass(frozen=True, eq=False)
 class StoredPredictions(Columns[Prediction]):
@@ -133,13 +129,15 @@ class StoredPredictions(Columns[Prediction]):
         """Predictions as they come: a thousand at a time are objects."""
         if isinstance(predictions, StoredPredictions):
             return predictions
-        coming, parts = iter(predictions), list[StoredPredictions]()
+        coming, parts = iter(predictions), dict[str, list[NDArray[Any]]]()
         while (some := list(islice(coming, _AT_ONCE))) or not parts:
             columns = {f.name: [getattr(p, f.name) for p in some] for f in fields(Prediction)}
             columns["persistent_root"] = [_wide(root, 0.0) for root in columns["persistent_root"]]
             columns["persistent_tau_s"] = [_wide(tau_s, 1.0) for tau_s in columns["persistent_tau_s"]]
-            parts.append(cls({name: _column(name, values) for name, values in columns.items()}))
-        return cls.join(parts)
+            for name, values in columns.items():
+                parts.setdefault(name, []).append(_column(name, values))
+        # The parts of a column are let go once it is joined: two of each would be what a long run takes at most.
+        return cls({name: np.concatenate(parts.pop(name)) for name in tuple(parts)})
 
     def made(self, k: int) -> Prediction:
         """Prediction k."""
@@ -188,7 +186,8 @@ class ByStamp(Mapping[int, Prediction]):
         return ByStamp(self.stored, {t: self._rows[t] for t in t_ns})
 
     def rows_of(self, log: VoLog) -> NDArray[np.int64]:
-        """(N,) row of ``stored`` for each motion of a log, -1 where nothing is said of it itself."""
+        """(N,) row of ``stored`` for each motion of a log; -1 where nothing is said of it, or of a window of motions
+        that ends there alone."""
         row = np.array([self._rows.get(t, -1) for t in log.t_ns.tolist()], dtype=np.int64)
         said = row >= 0
         said[said] = np.abs(self.stored.columns["dt_s"][row[said]] - log.column("dt_s")[said]) < _SAME_S

@@ -103,7 +103,7 @@ def test_what_cannot_be_written_is_refused_before_the_work(tmp_path: Path) -> No
 
 def test_an_empty_file_is_nobodys(tmp_path: Path) -> None:
     """As ``mktemp`` makes one; and one that cannot be told from another kind is refused with its bytes."""
-    (tmp_path / "empty").touch()
+    (tmp_path / "empty").write_text("\n")
     write_text(tmp_path / "empty", "gpvo: mine", own=(b"^gpvo", "text"))
     write_text(tmp_path / "empty", "gpvo: again", own=(b"^gpvo", "text"))
     with pytest.raises(OutputError, match="not an earlier page"):
