@@ -109,3 +109,15 @@ def test_an_empty_file_is_nobodys(tmp_path: Path) -> None:
     with pytest.raises(OutputError, match="not an earlier page"):
         write_text(tmp_path / "empty", "<html>", own=(b"<html>", "page"))
     assert (tmp_path / "empty").read_text() == "gpvo: again"
+
+
+def test_a_current_folder_that_is_gone_is_named(
+    capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch, tmp_path: Path, made: dict[str, str]
+) -> None:
+    """As of a shell whose folder another one has removed."""
+    (tmp_path / "gone").mkdir()
+    monkeypatch.chdir(tmp_path / "gone")
+    (tmp_path / "gone").rmdir()
+    code, said = main(capsys, monkeypatch, "import", made["plan"], "-o", "run")
+    assert (code, said) == (2, ["gpvo: the current folder: No such file or directory"])
+    assert main(capsys, monkeypatch, "import", made["plan"], "-o", tmp_path / "run") == (0, [])
