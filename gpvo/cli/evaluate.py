@@ -158,7 +158,7 @@ def _loaded(runs: list[Path], judge: JudgeOptions) -> tuple[list[Run], Predictor
     refuse_twice(runs)
     model = judge.model
     predictor = None if model is None else Predictor.load(model).require_motions(model)
-    loaded = [read_run(path) for path in runs]
+    loaded = [replace(read_run(path), imu=None) for path in runs]  # which no score asks for, and hours of it are large
     if judge.truth is not None:
         trajectory = read_tum(judge.truth)
         loaded = [replace(run, truth=TruthLog(trajectory.t_ns, trajectory.T_world_body)) for run in loaded]

@@ -137,7 +137,11 @@ class StoredPredictions(Columns[Prediction]):
             for name, values in columns.items():
                 parts.setdefault(name, []).append(_column(name, values))
         # The parts of a column are let go once it is joined: two of each would be what a long run takes at most.
-        return cls({name: np.concatenate(parts.pop(name)) for name in tuple(parts)})
+        joined = {name: np.concatenate(parts.pop(name)) for name in tuple(parts)}
+        tau_s = joined["persistent_tau_s"]
+        if len(tau_s) and (tau_s == tau_s[0]).all():  # as of one model
+            joined["persistent_tau_s"] = np.broadcast_to(tau_s[0].copy(), tau_s.shape)
+        return cls(joined)
 
     def made(self, k: int) -> Prediction:
         """Prediction k."""
