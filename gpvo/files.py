@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import csv
 import errno
+import hashlib
 import io
 import json
 import math
@@ -12,13 +13,16 @@ import re
 import stat
 import tempfile
 from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
-from contextlib import contextmanager, suppress
+from contextlib import contextmanager
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from gpvo.errors import GpvoError, OutputError, SourceError, printable
+
+if TYPE_CHECKING:
+    from jinja2 import Environment
 
 try:
     import fcntl
@@ -30,6 +34,8 @@ _MAX_TOML_BYTES = 200_000
 _STEP_BYTES = 1 << 20
 _AT_ONCE: int = getattr(os, "O_NONBLOCK", 0)  # Windows has no pipes among its files
 _BARE = re.compile(r"[A-Za-z0-9_-]+")
+Own = tuple[bytes, str]
+"""A pattern that every file of a kind bears, if gpvo wrote it, and what to call the kind."""
 
 
 class TooLarge(Exception):
@@ -64,16 +70,18 @@ def read_bounded(path: Path, most: int, beyond: str, kind: type[GpvoError] = Sou
 
 
 @contextmanager
-def replacing(path: Path) -> Iterator[Path]:
-    """A temporary path beside ``path`` to write to; at the end of the block it takes its place.
+def replacing(path: Path, own: Own | None = None) -> Iterator[Path]:
+    """A temporary path beside ``path`` to write to, in a folder made on the way; at the end of the block it takes its
+    place.
 
     If the block fails, what was written is removed, and ``path`` is as it was. No two writers share a name. Raises
-    OutputError, naming ``path``, where the block or the replacement raises OSError: no folder, no right, no space.
+    OutputError, naming ``path``, where it is not of its ``own`` kind (:func:`refuse_foreign`), or the block or the
+    replacement raises OSError: no right, no space.
     """
     temporary: Path | None = None
+    refuse_foreign(path, *own or (b"", "file"))
+    make_folder(path.parent)
     try:
-        if path.exists() and not (path.is_file() or path.is_dir()):
-            raise OSError(errno.EINVAL, "it is a device or a pipe, not a file")
         handle, name = tempfile.mkstemp(dir=path.parent, prefix=f".{path.name}.", suffix=".part")
         os.close(handle)
         temporary = Path(name)
@@ -91,9 +99,21 @@ def replacing(path: Path) -> Iterator[Path]:
 
 
 def refuse_foreign(path: Path, mark: bytes, what: str) -> None:
-    """Raise OutputError where ``path`` is a file without the ``mark`` that every ``what`` of gpvo bears in its first or
-    last megabyte: somebody's, which no output replaces."""
-    if not path.is_file():
+    """Raise OutputError, as well before the work as at its end, where no ``what`` can be written to ``path``.
+
+    It is a folder, a device or a pipe; or its folder can be neither made nor written to; or it is a file without the
+    ``mark``, a pattern that every ``what`` of gpvo matches in its first or last megabyte: somebody's, which no output
+    replaces. An empty file is nobody's.
+    """
+    if path.is_dir():
+        raise OutputError("is a folder", where=path, cure="name a file")
+    if path.exists() and not path.is_file():
+        raise OutputError("cannot be written: it is a device or a pipe, not a file", where=path)
+    folder = next((p for p in path.parents if p.exists()), path.parent)
+    if not folder.is_dir() or not os.access(folder, os.W_OK | os.X_OK):
+        reason = "may not be written to" if folder.is_dir() else "is no folder"
+        raise OutputError(f"cannot be written: {folder} {reason}", where=path, cure="name a file in a writable folder")
+    if not mark or not path.is_file():
         return
     try:
         with path.open("rb") as file:
@@ -102,7 +122,7 @@ def refuse_foreign(path: Path, mark: bytes, what: str) -> None:
             ends += file.read()
     except OSError as error:
         raise OutputError(f"cannot be read: {error.strerror}", where=path) from None
-    if mark not in ends:
+    if ends.strip() and not re.search(mark, ends, re.DOTALL):
         raise OutputError(f"is another file, not an earlier {what}", where=path, cure="choose another name")
 
 
@@ -115,24 +135,25 @@ def make_folder(path: Path) -> Path:
     return path
 
 
-def is_writable(path: Path) -> bool:
-    """Whether a file can be made under this name, whose folder is made."""
-    with suppress(OutputError):
-        make_folder(path.parent)
-    return path.parent.is_dir() and os.access(path.parent, os.W_OK)
-
-
-def write_text(path: Path, text: str, encoding: str = "utf-8") -> None:
+def write_text(path: Path, text: str, encoding: str = "utf-8", own: Own | None = None) -> None:
     """Write a text file whole or not at all; lines end as in ``text``. Raises as :func:`replacing`."""
-    with replacing(path) as temporary:
+    with replacing(path, own) as temporary:
         temporary.write_bytes(text.encode(encoding))
 
 
-def write_arrays(path: Path, arrays: Mapping[str, Any]) -> None:
-    """Write named arrays as a packed ``.npz`` whole or not at all, in a folder made on the way."""
-    make_folder(path.parent)
-    with replacing(path) as temporary, temporary.open("wb") as stream:
+def write_arrays(path: Path, arrays: Mapping[str, Any], own: Own | None = None) -> None:
+    """Write named arrays as a packed ``.npz`` whole or not at all. Raises as :func:`replacing`."""
+    with replacing(path, own) as temporary, temporary.open("wb") as stream:
         np.savez_compressed(stream, allow_pickle=False, **{k: np.asarray(v) for k, v in arrays.items()})
+
+
+def digest_of_file(path: Path) -> str:
+    """SHA-256 of a file, which may not fit into memory: the tracks of a long run."""
+    sha = hashlib.sha256()
+    with path.open("rb") as file:
+        while block := file.read(_STEP_BYTES):
+            sha.update(block)
+    return sha.hexdigest()
 
 
 class FolderLock:
@@ -196,9 +217,9 @@ def plain(value: Any, other: Callable[[Any], Any] = str) -> Any:
     return str(value) if isinstance(value, str) else other(value)
 
 
-def write_json(path: Path, document: Mapping[str, Any]) -> None:
+def write_json(path: Path, document: Mapping[str, Any], own: Own | None = None) -> None:
     """Write a document under a temporary name, then put it in place."""
-    write_text(path, json.dumps(plain(document), indent=1, allow_nan=False) + "\n")
+    write_text(path, json.dumps(plain(document), indent=1, allow_nan=False) + "\n", own=own)
 
 
 def read_json(path: Path, *, as_is: Collection[str] = ()) -> dict[str, Any]:
@@ -292,13 +313,15 @@ def _toml_value(value: Any) -> str:
 
 
 def write_csv(path: Path, columns: Mapping[str, Sequence[Any]]) -> None:
-    """Write columns of one length with their names; None and NaN are left empty, other numbers exact."""
+    """Write columns of one length with their names; None and NaN are left empty, other numbers exact. Another table
+    than one that begins with the same column is not replaced."""
     stream = io.StringIO()
     writer = csv.writer(stream, lineterminator="\n")
     writer.writerow(columns)
     plain = (c.tolist() if hasattr(c, "tolist") else c for c in columns.values())
     writer.writerows([None if v != v else v for v in row] for row in zip(*plain, strict=True))
-    write_text(path, stream.getvalue())
+    head = rb"\A" + re.escape(next(iter(columns), "").encode()) + rb"[,\n]"
+    write_text(path, stream.getvalue(), own=(head, "table") if columns else None)
 
 
 def columns_of(rows: Sequence[Mapping[str, Any]]) -> dict[str, list[Any]]:
@@ -309,6 +332,15 @@ def columns_of(rows: Sequence[Mapping[str, Any]]) -> dict[str, list[Any]]:
 def in_metres(length_m: float) -> str:
     """A length for people: to a decimetre, of less than a metre, as of an endoscope's path, three digits."""
     return f"{length_m:{'.1f' if length_m >= 1 else '.3g'}} m"
+
+
+def templates(*packages: str, **options: Any) -> Environment:
+    """The Jinja templates of packages, which fill in HTML escaped and other text as it is; further ``options``: of
+    Jinja's environment. Raises ImportError without Jinja."""
+    from jinja2 import ChoiceLoader, Environment, PackageLoader, select_autoescape
+
+    loader = ChoiceLoader([PackageLoader(package) for package in packages])
+    return Environment(loader=loader, autoescape=select_autoescape(), trim_blocks=True, **options)
 
 
 def markdown_table(head: Sequence[str], rows: Sequence[Sequence[str]]) -> list[str]:

@@ -95,8 +95,9 @@ def main() -> None:
             raise
         _fail(str(MissingExtraError(package, _extra(package))))
     except OSError as error:  # a full disk, a folder in place of a file; a broken pipe has ended inside quietly
-        place = f"{error.filename}: " if error.filename else ""
-        _fail(place + " ".join((error.strerror or str(error)).split()))
+        # Only what asks for the current folder misses something without a name.
+        place = error.filename or ("the current folder" if isinstance(error, FileNotFoundError) else "")
+        _fail(": ".join(filter(None, (place, " ".join((error.strerror or str(error)).split())))))
     except typer.Abort:
         raise KeyboardInterrupt from None
 

@@ -128,11 +128,11 @@ def report(
 
     Example: gpvo report runs/mh01 -o report.html
     """
-    from gpvo.evaluation.report import write_report
+    from gpvo.evaluation.report import PAGE, write_report
 
     if sequence is not None and frames is None:
         raise GpvoError("--sequence has no effect without --frames", cure="add --frames, such as 5,80")
-    refuse_foreign(out, b"<title>gpvo report</title>", "report")  # before the work, not after it
+    refuse_foreign(out, *PAGE)  # before the work, not after it
     found = _evaluate(runs, judge, unjudged=True)
     pictures = [] if frames is None else _pictures(runs, frames, sequence)
     with progress("pages", 1):
@@ -158,7 +158,7 @@ def _loaded(runs: list[Path], judge: JudgeOptions) -> tuple[list[Run], Predictor
     refuse_twice(runs)
     model = judge.model
     predictor = None if model is None else Predictor.load(model).require_motions(model)
-    loaded = [read_run(path) for path in runs]
+    loaded = [replace(read_run(path), imu=None) for path in runs]  # which no score asks for, and hours of it are large
     if judge.truth is not None:
         trajectory = read_tum(judge.truth)
         loaded = [replace(run, truth=TruthLog(trajectory.t_ns, trajectory.T_world_body)) for run in loaded]

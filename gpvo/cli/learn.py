@@ -71,9 +71,9 @@ def train(
 
     Example: gpvo train runs/a runs/b runs/c -o errors.gpvo
     """
-    from gpvo.learning.store import check_writable, config_of, folds_path, save_model
+    from gpvo.learning.store import config_of, folds_path, refuse_foreign_model, save_model
 
-    check_writable(out)
+    refuse_foreign_model(out)
     settings = asdict(options) | {"time_offset_s": time_offset(options.time_offset_s)}
     if update is not None:
         settings = asdict(config_of(update)) | {k: v for k, v in settings.items() if is_given(ctx, k)}

@@ -12,10 +12,9 @@ import typer
 
 from gpvo.cli.output import Json, answer, print_json, progress, say, show
 from gpvo.errors import GpvoError
-from gpvo.files import make_folder, refuse_foreign, write_csv
+from gpvo.files import refuse_foreign, write_csv
 from gpvo.io.parquet import write_table
-from gpvo.io.run import read_run, write_predictions
-from gpvo.io.run_folder import FILES
+from gpvo.io.run import PREDICTIONS, read_run, write_predictions
 from gpvo.online.predictor import Predictor
 from gpvo.types import StoredPredictions
 
@@ -41,22 +40,20 @@ def predict(
     from gpvo.dataset.check import warn_of_misfits
     from gpvo.evaluation.evaluate import distinct
 
-    if len(runs) == 1 and out.is_dir():
-        raise GpvoError("is a folder", where=out, cure="give a file that ends in .parquet")
     if len(runs) == 1 and out.suffix.lower() != ".parquet":
         raise GpvoError("does not have the suffix of a Parquet file", where=out, cure="end it in .parquet")
     if len(runs) > 1 and out.is_file():
         raise GpvoError("is a file", where=out, cure="give a folder for the predictions of several runs")
+    names = distinct([r.resolve().name for r in runs])
+    targets = [out] if len(runs) == 1 else [out / f"{name}.parquet" for name in names]
+    for target in targets:
+        refuse_foreign(target, *PREDICTIONS)  # before the work, not after it
     predictor, documents = Predictor.load(model), []
     with progress("runs", len(runs)) as advance:
-        for path, name in zip(runs, distinct([r.resolve().name for r in runs]), strict=True):
+        for path, target in zip(runs, targets, strict=True):
             run = read_run(path)
             warn_of_misfits(model, predictor, run)
             predictions = predictor.replay(run.log).stored
-            target = out if len(runs) == 1 else out / f"{name}.parquet"
-            if target.exists() and target.name in FILES and target.name != "predictions.parquet":
-                raise GpvoError("is part of a run, not a file of predictions", where=target, cure="choose another -o")
-            make_folder(target.parent)
             write_predictions(target, predictions)
             documents.append({"run": str(path), "file": str(target), **_summary(predictions)})
             advance()

@@ -106,7 +106,7 @@ def calibration(
 
     Example: gpvo calibration runs/mine -o corrected.yaml
     """
-    from gpvo.vo.rig_findings import camchain, corrected, document, explained_px, read_state, rig_of
+    from gpvo.vo.rig_findings import CAMCHAIN, camchain, corrected, document, explained_px, read_state, rig_of
 
     camera = read_run(run).log.camera
     if camera is None:
@@ -116,7 +116,7 @@ def calibration(
     rig = rig_of(read_json(run / "rig.json").get("calibration"), camera)
     found_px, left_px = explained_px(rig, state, camera)
     if out is not None:
-        write_text(out, camchain(corrected(rig, state, camera) if found["findings"] else rig))
+        write_text(out, camchain(corrected(rig, state, camera) if found["findings"] else rig), own=CAMCHAIN)
     if json_:
         print_json({"run": str(run), **found, "found_px": found_px, "unexplained_px": left_px})
         return

@@ -11,7 +11,7 @@ import typer
 
 from gpvo.cli.output import Json, answer, progress
 from gpvo.errors import GpvoError
-from gpvo.files import parse_toml
+from gpvo.files import parse_toml, refuse_foreign
 
 if TYPE_CHECKING:
     from gpvo.sim.scenario import Flight, Scenario
@@ -61,6 +61,10 @@ def simulate(
         raise GpvoError("does not have the suffix of a PNG", where=preview, cure="end it in .png")
     if points and preview:
         raise GpvoError("--points draws no images to preview", cure="leave out one of --points, --preview")
+    if preview is not None:
+        from gpvo.sim.sequence import SHEET
+
+        refuse_foreign(preview, *SHEET)  # before the work, not after it
     from gpvo.sim.scenario import fly_campaign, load_scenario, stated_seed, warn_of_unused
 
     given = {"duration_s": duration, "rate_hz": rate, "speed_mps": speed, "camera": camera,

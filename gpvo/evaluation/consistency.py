@@ -38,7 +38,7 @@ _SCORED = ("nees_dof_median", "coverage", "nll_per_dim", "nll_stated_per_dim", "
 HORIZONS_M = (1.0, 10.0, 100.0)
 TOO_FAR = 2.5
 """Times a span: where frames are sparser than it, or missing, what lies between two of them is not called by it."""
-_MAX_WINDOWS = 60
+_MAX_WINDOWS, _AT_ONCE = 60, 1000
 # Times that are sums of a frame period must not miss the round number.
 _HAIR = 1 - 1e-9
 _NOISELESS = np.zeros(6)
@@ -122,9 +122,13 @@ def consistency(
         return None
     index, d = errors.index[stated], statement.dof
     axes = counted_axes(seen_axes(errors.xi), d)
+    T_stated = errors.T_true[stated]
     e, C = (errors.xi[stated] - statement.mean[index])[:, :d], C[stated]
-    noise = truth_noise(errors.T_true[stated], noise_sigma)[:, :d, :d]
-    per_block, with_noise = nees_by_block(e, C, axes), nees_by_block(e, C + noise, axes)
+    per_block, with_noise = nees_by_block(e, C, axes), dict[str, list[float]]()
+    for rows in np.array_split(np.arange(len(e)), len(e) // _AT_ONCE + 1):
+        noise = truth_noise(T_stated[rows], noise_sigma)[:, :d, :d]
+        for name, values in nees_by_block(e[rows], C[rows] + noise, axes).items():
+            with_noise.setdefault(name, []).extend(values.tolist())
     scores = score(errors.xi[stated], statement.mean[index], C, statement.nu, axes)
     energy = {unit: _energy(e, C, axes[np.isin(axes, BLOCKS[block])]) for unit, block in UNITS.items()}
     e, C = e[:, axes], marginal(C, axes)
@@ -140,7 +144,7 @@ def consistency(
         count=int(stated.sum()),
         axes=tuple(axes.tolist()),
         nees_dof={n: block_bootstrap(per_block[n]) if n in per_block else None for n in BLOCKS},
-        nees_dof_truth_noise={n: float(with_noise[n].mean()) if n in with_noise else None for n in BLOCKS},
+        nees_dof_truth_noise={n: float(np.mean(with_noise[n])) if n in with_noise else None for n in BLOCKS},
         **{name: scores[name] for name in _SCORED},
         energy=energy,
         correlation_gain_nats=float(correlation_gain(e, C).mean()),

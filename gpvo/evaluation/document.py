@@ -152,7 +152,6 @@ def _method_document(c: Consistency) -> dict[str, Any]:
 def write_tables(e: Evaluation, folder: Path, name: str) -> list[Path]:
     """``NAME_est.tum`` and ``NAME_truth.tum`` (evo: ``evo_ape tum NAME_truth.tum NAME_est.tum``), ``NAME_motions.csv``
     (each motion's error and every method's sigma), and ``NAME_methods.csv`` and ``.tex`` (scores)."""
-    folder.mkdir(parents=True, exist_ok=True)
     log, known = e.run.log, e.covered
     paths = [
         folder / f"{name}_{kind}" for kind in ("est.tum", "truth.tum", "motions.csv", "methods.csv", "methods.tex")
@@ -168,7 +167,7 @@ def write_tables(e: Evaluation, folder: Path, name: str) -> list[Path]:
     write_csv(paths[2], columns)
     scores = _scores(run_document(e)["methods"])
     write_csv(paths[3], scores)
-    write_text(paths[4], latex(scores))
+    write_text(paths[4], latex(scores), own=(rb"\A\\begin\{tabular\}", "table"))
     return paths
 
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from functools import cached_property
+from functools import cached_property, partial
 from pathlib import Path
 
 import numpy as np
@@ -70,7 +70,7 @@ class Evaluation:
     run: Run
     errors: MotionErrors
     trajectory: TrajectoryErrors
-    statements: tuple[Statement, ...]
+    statements: Sequence[Statement]
     consistency: Mapping[str, Consistency]
     covered: NDArray[np.bool_]
     T_est: Array
@@ -89,11 +89,11 @@ class Evaluation:
     misfits: tuple[str, ...] = ()
     poses: PoseConsistency | None = None
 
-    @property
+    @cached_property
     def shown(self) -> Statement | None:
         """The statement to draw bounds of: ``learned`` if there is one, else ``triangulation``, else any full one."""
-        full = {s.method: s for s in self.statements if s.errors is not None}
-        return full.get("learned") or full.get("triangulation") or next(iter(full.values()), None)
+        full, rank = (s for s in self.statements if s.errors is not None), {"learned": 0, "triangulation": 1}
+        return min(full, key=lambda s: rank.get(s.method, 2), default=None)
 
     @property
     def shown_method(self) -> str:
@@ -156,9 +156,10 @@ def evaluate_run(
     on_its_clock = on_clock_of_log(truth, late_s) if late_s else truth
     misread = Misread.of(scored, on_its_clock)
     T_est = log.trajectory()
-    made = [*statements(log, predictions, predictor), *further]
+    made = statements(log, predictions, predictor, further)
     by_velocity = velocity_path(truth, log.t_ns) if options.truth_sigma is None else None
-    found = {s.method: consistency(s, errors, scored, T_true, known, sigma, by_velocity) for s in made}
+    judge = partial(consistency, errors=errors, log=scored, T_true=T_true, known=known, noise_sigma=sigma)
+    found = list(map(partial(judge, by_velocity=by_velocity), made))  # each statement is let go before the next
     first = int(np.flatnonzero(known)[0])
     trajectory = trajectory_errors(
         log.t_ns[known], T_est[known], T_true[known], options.segments_m, np.flatnonzero(known)
@@ -170,8 +171,8 @@ def evaluate_run(
         run=run,
         errors=errors,
         trajectory=trajectory,
-        statements=tuple(made),
-        consistency={m: c for m, c in found.items() if c is not None},
+        statements=made,
+        consistency={c.method: c for c in found if c is not None},
         covered=known,
         T_est=lift @ T_est,
         T_true=T_true,
@@ -225,7 +226,7 @@ def unjudged_run(run: Run, predictor: Predictor | None = None, misfits: tuple[st
         run=run,
         errors=MotionErrors(np.zeros(0, np.int64), np.zeros((0, 6)), none, none, np.zeros(0)),
         trajectory=TrajectoryErrors.of_positions(length),
-        statements=tuple(statements(run.log, predictions, predictor)),
+        statements=statements(run.log, predictions, predictor),
         consistency={},
         covered=np.zeros(len(run.log), bool),
         T_est=T_est,

@@ -15,7 +15,7 @@ from gpvo.dataset.check import check, predictor_of
 from gpvo.errors import GpvoError
 from gpvo.evaluation.evaluate import distinct
 from gpvo.evaluation.flights import constants_in, constants_of, flight_of, start_sigmas
-from gpvo.files import make_folder, write_text
+from gpvo.files import write_text
 from gpvo.filters.measurement import chi2_quantile
 from gpvo.filters.metrics import Scores
 from gpvo.filters.policies import CONSTANT_BEST, CONSTANT_HINDSIGHT, LEARNED, POLICIES, STATED
@@ -208,8 +208,7 @@ def write_log(path: Path, fused: FusedRun) -> None:
     told = np.column_stack([fused.nis, fused.residual, fused.residual_sigma]).tolist()
     for t_ns, outcome, values in zip(fused.t_ns.tolist(), fused.outcomes, told, strict=True):
         lines.append(",".join([str(t_ns), outcome, *(f"{v:.9g}" if np.isfinite(v) else "" for v in values)]))
-    make_folder(path.parent)
-    write_text(path, "\n".join(lines) + "\n", "ascii")
+    write_text(path, "\n".join(lines) + "\n", "ascii", (rb"\At_ns,outcome,nis,", "log of a filter"))
 
 
 def document(report: FusionReport) -> dict[str, Any]:

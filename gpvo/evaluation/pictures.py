@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 
 from gpvo.accumulation import PoseError
 from gpvo.errors import GpvoError
+from gpvo.files import make_folder, refuse_foreign
 from gpvo.geometry import se3
 from gpvo.io.source import Source
 from gpvo.runner import Step, steps
@@ -45,6 +46,8 @@ class LiveView:
         self._rr: Any = rerun
         rerun.init(f"gpvo {name}", spawn=file is None)
         if file is not None:
+            refuse_foreign(file, rb"\ARRF", "recording")
+            make_folder(file.parent)
             rerun.save(str(file))
         size = [camera.width, camera.height]
         rerun.log("world/camera/left", rerun.Pinhole(image_from_camera=camera.K, resolution=size), static=True)

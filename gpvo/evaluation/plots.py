@@ -19,9 +19,12 @@ from gpvo.evaluation.evaluate import Evaluation
 from gpvo.evaluation.forecast import Forecast
 from gpvo.evaluation.fusion import Trace, nis_band, nis_over_runs
 from gpvo.evaluation.panels import Drawing, Panel, colour, line
-from gpvo.files import make_folder, refuse_foreign, replacing
+from gpvo.files import refuse_foreign, replacing
 
-_SIGNED = ("png", "pdf", "svg", "eps", "ps")  # formats in which Matplotlib says that it drew them
+PLOT = (b"atplotlib", "plot")
+_SIGNATURE = {"jpg": {"comment": b"Matplotlib"}, "tif": {"tiffinfo": {305: "Matplotlib"}}}
+"""Matplotlib says in most formats that it drew them; in these it has to be told. A picture without it is somebody's."""
+_SIGNATURE |= {"jpeg": _SIGNATURE["jpg"], "tiff": _SIGNATURE["tif"]}
 
 
 def picture(e: Evaluation, of: Drawing) -> Figure:
@@ -118,8 +121,7 @@ def require_picture(path: Path) -> None:
     known = FigureCanvasBase.get_supported_filetypes()
     if path.suffix[1:].lower() not in known:
         raise GpvoError("does not have the suffix of an image", where=path, cure=f"choose from {', '.join(known)}")
-    if path.suffix[1:].lower() in _SIGNED:
-        refuse_foreign(path, b"atplotlib", "plot")
+    refuse_foreign(path, *PLOT)
 
 
 def fusion(traces: Sequence[Trace]) -> Figure:
@@ -161,6 +163,8 @@ def _innovations(traces: Sequence[Trace]) -> Panel:
 
 def save(figure: Figure, path: Path, **options: Any) -> None:
     """Write to an image file, whole or not at all; ``options``: of matplotlib's ``savefig``."""
-    make_folder(path.parent)
-    with replacing(path) as temporary:
-        figure.savefig(temporary, format=path.suffix[1:].lower(), **options)
+    kind = path.suffix[1:].lower()
+    if kind in _SIGNATURE:
+        options["pil_kwargs"] = _SIGNATURE[kind]
+    with replacing(path, PLOT) as temporary:
+        figure.savefig(temporary, format=kind, **options)

@@ -15,13 +15,14 @@ from gpvo.evaluation.document import document
 from gpvo.evaluation.evaluate import Evaluation
 from gpvo.evaluation.panels import spread
 from gpvo.evaluation.verdict import HONEST
-from gpvo.files import write_text
+from gpvo.files import templates, write_text
 from gpvo.geometry.covariance import half_axes
 from gpvo.types import Array
 
 if TYPE_CHECKING:
     from gpvo.evaluation.pictures import MatchPicture
 
+PAGE = (b"<title>gpvo report</title>", "report")
 _MAX_POINTS = 600
 
 
@@ -30,17 +31,12 @@ def write_report(
 ) -> None:
     """Write the page, whole or not at all. ``pictures``: matches of single frames of the only run; ``model``: name of
     the error model behind ``learned``."""
-    path.parent.mkdir(parents=True, exist_ok=True)
-    write_text(path, render(evaluations, pictures, model))
+    write_text(path, render(evaluations, pictures, model), own=PAGE)
 
 
 def render(evaluations: Sequence[Evaluation], pictures: Sequence[MatchPicture] = (), model: str = "") -> str:
     """The page as text. Its table shows the numbers of ``gpvo evaluate --json``."""
-    from jinja2 import Environment, PackageLoader, select_autoescape
-
-    environment = Environment(
-        loader=PackageLoader("gpvo.evaluation"), autoescape=select_autoescape(default=True), trim_blocks=True
-    )
+    environment = templates("gpvo.evaluation")
     environment.filters["number"] = _number
     environment.filters["tone"] = _tone
     runs = []

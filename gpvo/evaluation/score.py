@@ -157,9 +157,8 @@ def _of_sequence(method: Path, truth: Path) -> Path:
 
 def write_board(found: Mapping[str, Mapping[str, Any]], folder: Path) -> None:
     """``METHOD.json`` each, and ``board.csv`` with a line per method."""
-    folder.mkdir(parents=True, exist_ok=True)
     for method, scores in found.items():
-        write_json(folder / f"{method}.json", dict(scores))
+        write_json(folder / f"{method}.json", dict(scores), (b'"nees_dof_over"', "scores of a method"))
     write_csv(folder / "board.csv", board(found))
 
 
@@ -242,7 +241,6 @@ def write_statements(evaluation: Evaluation, folder: Path, name: str, waits: str
             known = known & ~((log.t_ns > first) & (log.t_ns < last))
         # A motion over the whole wait still has truth at both ends.
         known = known & ~(in_waits(log, waiting) & known[log.parent])
-    truth.parent.mkdir(parents=True, exist_ok=True)
     write_tum(truth, log.t_ns[known], evaluation.T_true[known])
     written = [truth]
     for statement in evaluation.statements:
@@ -250,7 +248,6 @@ def write_statements(evaluation: Evaluation, folder: Path, name: str, waits: str
             continue
         T, C = corrected(log, statement.mean), np.where(log.usable[:, None, None], statement.covariance, np.nan)
         path = folder / statement.method / name
-        path.parent.mkdir(parents=True, exist_ok=True)
         write_stated(path, log, T, C)
         written.append(path)
     return written

@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING, Any
+from functools import partial
+from typing import TYPE_CHECKING, Any, Generic, TypeVar
 
 import numpy as np
 
@@ -14,10 +15,14 @@ from gpvo.geometry.covariance import where_stated
 from gpvo.learning.methods import simple_covariances
 from gpvo.learning.thesis import ThesisModel
 from gpvo.online.features import FeatureStream
-from gpvo.types import IMPORTED_POSE, Array, MotionError, Prediction, Status, VoLog
+from gpvo.types import IMPORTED_POSE, Array, ByStamp, MotionError, Prediction, Status, VoLog
 
 if TYPE_CHECKING:
     from gpvo.online.predictor import Predictor
+
+T = TypeVar("T")
+_NOTHING = np.eye(6) * 1e-6  # covariance of a motion before anything was said of one
+_AT_ONCE = 1000
 
 
 @dataclass(frozen=True)
@@ -42,32 +47,44 @@ class Statement:
 
 
 def statements(
-    log: VoLog, predictions: Mapping[int, Prediction] | None = None, predictor: Predictor | None = None
-) -> list[Statement]:
-    """All methods that can be stated of this log.
+    log: VoLog,
+    predictions: Mapping[int, Prediction] | None = None,
+    predictor: Predictor | None = None,
+    further: Iterable[Statement] = (),
+) -> Sequence[Statement]:
+    """All methods that can be stated of this log, and ``further`` ones; each is made whenever it is asked for, as those
+    of a long run would fill the memory.
 
     Geometric ones from its records, each with its translation-only ``_vt``; ``constant``, ``_scaled`` and
     ``gp_thesis`` from the model file (null where it holds none); ``base`` from the model with its GP held at its mean
     function; ``learned`` from predictions by stamp.
     """
-    out: list[Statement] = []
     arrays = predictor.arrays if predictor is not None else {}
-    covariances = {m: where_stated(log.covariance(m)) for m in log.methods if m != IMPORTED_POSE}
-    v_t = {m: _translation_alone(log, m) for m in covariances}
-    for method, C in simple_covariances(arrays, covariances, v_t, len(log)).items():
-        if method == "constant":
-            C = C * _frames_bridged(log)[:, None, None]
-        elif method.endswith("_scaled"):
-            # The scale was fitted to measured motions; what is said of a lost one is no pixel noise and stands.
-            C = np.where(log.usable[:, None, None], C, covariances[method.removesuffix("_scaled")])
-        out.append(plain_statement(log, method, C))
+    names = {m: np.zeros((0, 6, 6)) for m in log.methods if m != IMPORTED_POSE}
+    makers: list[Callable[[], Statement]] = [
+        partial(_simple, log, arrays, method) for method in simple_covariances(arrays, names, names, 0)
+    ]
+    kept = list(further)
     if "thesis.scale" in arrays and predictor is not None and predictor.target == "frame":
-        out.append(_thesis(log, ThesisModel.of_file(arrays)))
+        makers.append(partial(_thesis, log, ThesisModel.of_file(arrays)))
     if predictions and predictor is not None:
-        out.append(predicted_statement("base", log, predictor.base().replay(log)))
+        makers.append(partial(predicted_statement, "base", log, predictor.base().replay(log)))
     if predictions:
-        out.append(predicted_statement("learned", log, predictions))
-    return out
+        makers.append(partial(predicted_statement, "learned", log, predictions))
+    return _Rows(lambda k: makers[k]() if k < len(makers) else kept[k - len(makers)], len(makers) + len(kept))
+
+
+def _simple(log: VoLog, arrays: Mapping[str, Any], name: str) -> Statement:
+    """One of :func:`simple_covariances` over the log."""
+    method, is_vt = name.removesuffix("_scaled").removesuffix("_vt"), name.endswith("_vt")
+    stated = {} if is_vt or name == "constant" else {method: where_stated(log.covariance(method))}
+    C = simple_covariances(arrays, stated, {method: _translation_alone(log, method)} if is_vt else {}, len(log))[name]
+    if name == "constant":
+        C = C * _frames_bridged(log)[:, None, None]
+    elif name != method and not is_vt:
+        # The scale was fitted to measured motions; what is said of a lost one is no pixel noise and stands.
+        C = np.where(log.usable[:, None, None], C, stated[method])
+    return plain_statement(log, name, C)
 
 
 def _frames_bridged(log: VoLog) -> Array:
@@ -89,28 +106,24 @@ def _thesis(log: VoLog, model: ThesisModel) -> Statement:
 def plain_statement(log: VoLog, method: str, covariance: Array) -> Statement:
     """A method that takes motions as independent, without a mean: covariances (N, 6, 6), NaN where it says nothing; or
     (N, 3, 3) of translations alone, which do not add up to poses."""
-    mean = np.zeros((len(log), 6))
+    mean = np.broadcast_to(np.zeros(6), (len(log), 6))
     if covariance.shape[-1] == 3:
         return Statement(method, mean, covariance, None)
     # A motion that nobody vouches for enters the sum with what was said of the one before.
-    vouched = np.where(np.isfinite(covariance).all(axis=(1, 2)), np.arange(1, len(log) + 1), 0)
-    filled = covariance
-    if not vouched.all():
-        filled = np.concatenate([np.eye(6)[None] * 1e-6, covariance])[np.maximum.accumulate(vouched)]
-    dt_s = log.column("dt_s")
-    return Statement(
-        method,
-        mean,
-        covariance,
-        _Rows(lambda k: MotionError.independent(filled[k], dt_s=float(dt_s[k])), len(log)),
-    )
+    vouched = np.where(np.isfinite(covariance).all(axis=(1, 2)), np.arange(len(log)), -1)
+    source, dt_s = np.maximum.accumulate(vouched), log.column("dt_s")
+
+    def held(k: int) -> MotionError:
+        return MotionError.independent(_NOTHING if source[k] < 0 else covariance[source[k]], dt_s=float(dt_s[k]))
+
+    return Statement(method, mean, covariance, _Rows(held, len(log)))
 
 
 @dataclass(frozen=True)
-class _Rows(Sequence[MotionError]):
-    """N errors, each ``made`` when it is asked for: as objects, those of a long run would fill the memory."""
+class _Rows(Sequence[T], Generic[T]):
+    """N items, each ``made`` when it is asked for: as objects, those of a long run would fill the memory."""
 
-    made: Callable[[int], MotionError]
+    made: Callable[[int], T]
     n: int
 
     def __len__(self) -> int:
@@ -131,18 +144,19 @@ def _translation_alone(log: VoLog, method: str) -> Array:
 
 def predicted_statement(method: str, log: VoLog, predictions: Mapping[int, Prediction]) -> Statement:
     """What a model predicts, by stamp; a motion that it says nothing of is taken to be like the one before."""
+    given = predictions if isinstance(predictions, ByStamp) else ByStamp.of(predictions.values())
+    dt_s, statuses, row = log.column("dt_s"), log.statuses, given.rows_of(log)
     mean, covariance = np.zeros((len(log), 6)), np.full((len(log), 6, 6), np.nan)
-    is_own = np.zeros(len(log), bool)
-    for k, record in enumerate(log):
-        prediction = predictions.get(record.t_ns)
-        if prediction is not None and prediction.is_of(record) and record.status is not Status.START:
-            mean[k], covariance[k], is_own[k] = prediction.mean, prediction.covariance, True
+    is_own = (row >= 0) & np.array([status is not Status.START for status in statuses], bool)
+    own = np.flatnonzero(is_own)
+    for some in np.array_split(own, len(own) // _AT_ONCE + 1):
+        batch = given.stored.batch(row[some])
+        mean[some], covariance[some] = batch.mean, batch.covariance
     source = np.maximum.accumulate(np.where(is_own, np.arange(len(log)), -1))
-    t_ns, dt_s, statuses = log.t_ns, log.column("dt_s"), log.statuses
-    nothing = MotionError.independent(np.eye(6) * 1e-6)
+    nothing = MotionError.independent(_NOTHING)
 
     def held(k: int) -> MotionError:
-        error = nothing if source[k] < 0 else predictions[int(t_ns[source[k]])]
+        error = nothing if source[k] < 0 else given.stored.made(int(row[source[k]]))
         return replace(error, status=error.status if is_own[k] else statuses[k], dt_s=float(dt_s[k]) or error.dt_s)
 
     return Statement(method, mean, covariance, _Rows(held, len(log)))
@@ -150,5 +164,4 @@ def predicted_statement(method: str, log: VoLog, predictions: Mapping[int, Predi
 
 def corrected(log: VoLog, mean: Array) -> Array:
     """(N, 4, 4) ``T_first_cam`` of the log with the predicted ``mean`` (N, 6) taken off each motion."""
-    moved = zip(log, log.T_prev_cur @ se3.exp(-mean), strict=True)
-    return VoLog([replace(record, T_prev_cur=T) for record, T in moved]).trajectory()
+    return log.trajectory(log.T_prev_cur @ se3.exp(-mean))

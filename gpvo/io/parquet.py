@@ -19,7 +19,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from gpvo.errors import SourceError
-from gpvo.files import replacing
+from gpvo.files import Own, replacing
 
 if TYPE_CHECKING:
     import pyarrow as pa
@@ -58,17 +58,19 @@ class RowGroup:
     place: NDArray[np.int64]
 
 
-def write_table(path: Path, columns: Mapping[str, Any], metadata: Mapping[str, str] | None = None) -> RowGroup:
+def write_table(
+    path: Path, columns: Mapping[str, Any], metadata: Mapping[str, str] | None = None, own: Own | None = None
+) -> RowGroup:
     """Write columns of one length in place of what was there, or not at all. None and NaN become null.
 
-    Raises SourceError, naming ``path``, where it cannot be written.
+    Raises OutputError, naming ``path``, as :func:`gpvo.files.replacing`.
     """
     rows = len(next(iter(columns.values()), ()))
     pages = [_page(values, KIND_OF.get(name, "float64")) for name, values in columns.items()]
     sizes = np.array([[len(page), plain] for page, plain in pages], dtype=np.int64).reshape(-1, 2)
     offset = len(_MAGIC) + np.cumsum(sizes[:, 0]) - sizes[:, 0]
     group = RowGroup(path, rows, tuple(columns), np.column_stack([offset, sizes]))
-    with replacing(path) as temporary:
+    with replacing(path, own) as temporary:
         temporary.write_bytes(b"".join([_MAGIC, *(page for page, _ in pages), _footer([group], metadata)]))
     return group
 

@@ -8,7 +8,6 @@ An interrupted run can be read from its chunks, and resumes from the last of the
 
 from __future__ import annotations
 
-import hashlib
 import platform
 import shutil
 import time
@@ -24,7 +23,7 @@ import numpy as np
 
 from gpvo import __version__
 from gpvo.errors import SourceError
-from gpvo.files import write_json, write_toml
+from gpvo.files import digest_of_file, write_json, write_toml
 from gpvo.geometry.covariance import are_covariances, from_upper, upper
 from gpvo.io import run_folder, run_table
 from gpvo.io.parquet import RowGroup, join_tables, write_table
@@ -47,6 +46,7 @@ __all__ = [
     "write_run",
 ]
 
+PREDICTIONS = (b"cov_total_00", "file of predictions")
 _POSES = 20_000  # that came or served last, as possible starts of later motions
 
 
@@ -224,15 +224,6 @@ class RunWriter:
         )
 
 
-def digest_of_file(path: Path) -> str:
-    """SHA-256 of a file, which may not fit into memory: the tracks of a long run."""
-    sha = hashlib.sha256()
-    with path.open("rb") as file:
-        while block := file.read(1 << 20):
-            sha.update(block)
-    return sha.hexdigest()
-
-
 @dataclass
 class _State:
     """What the writer carries from record to record; its size does not grow with the run."""
@@ -298,7 +289,7 @@ def copy_run(
 
 def write_predictions(path: str | Path, predictions: Iterable[Prediction]) -> None:
     """Write predictions as a Parquet file of their own, as ``gpvo predict`` does."""
-    write_table(Path(path), run_table.prediction_columns(predictions), {"schema": str(SCHEMA)})
+    write_table(Path(path), run_table.prediction_columns(predictions), {"schema": str(SCHEMA)}, PREDICTIONS)
 
 
 def as_stored(record: VoRecord) -> VoRecord:

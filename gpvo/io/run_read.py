@@ -62,7 +62,7 @@ class Run:
     def predictions_of_motions(self) -> ByStamp:
         """What is stored, by time stamp, but for predictions over windows of motions."""
         stored = ByStamp.of(self.predictions)
-        return stored.only(r.t_ns for r in self.log if r.t_ns in stored and stored[r.t_ns].is_of(r))
+        return stored.only(self.log.t_ns[stored.rows_of(self.log) >= 0].tolist())
 
     def __str__(self) -> str:
         parts = [f"{len(self.log)} records"]

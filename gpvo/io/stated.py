@@ -18,7 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from gpvo.errors import SourceError
-from gpvo.files import write_text
+from gpvo.files import replacing
 from gpvo.geometry import se3
 from gpvo.geometry.covariance import (
     are_covariances,
@@ -48,11 +48,15 @@ _LINES = (
 def write_stated(path: Path, log: VoLog, T_world_cam: Array, covariance: Array) -> None:
     """Poses (N, 4, 4) of a log's frames and covariances (N, 6, 6) of its motions, NaN where unknown; whole or not at
     all."""
-    lines = (
-        f"{tum_line(r.t_ns, T)} {' '.join(f'{c:.9g}' for c in upper(C))} {ns_to_seconds_text(r.t_prev_ns)}"
-        for r, T, C in zip(log, T_world_cam, covariance, strict=True)
-    )
-    write_text(path, "\n".join([*_LINES, *lines]) + "\n", "ascii")
+    stamps = zip(log.t_ns.tolist(), log.column("t_prev_ns").tolist(), T_world_cam, upper(covariance), strict=True)
+    with (
+        replacing(path, (HEADER.encode(), "file of stated motions")) as temporary,
+        temporary.open("w", encoding="ascii", newline="\n") as file,
+    ):
+        file.writelines(f"{line}\n" for line in _LINES)
+        for t_ns, t_prev_ns, T, C in stamps:
+            stated = " ".join(f"{c:.9g}" for c in C)
+            file.write(f"{tum_line(t_ns, T)} {stated} {ns_to_seconds_text(t_prev_ns)}\n")
 
 
 def read_stated(path: Path) -> VoLog:

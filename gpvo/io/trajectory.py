@@ -116,10 +116,13 @@ def read_times(path: str | Path) -> Stamps:
     return np.array(stamps, dtype=np.int64)
 
 
+TUM = (rb"\A-?\d+\.\d{9}( -?\d+\.\d{9}){7}\n", "trajectory")  # as tum_line writes it
+
+
 def write_tum(path: str | Path, t_ns: Stamps, T_world_body: Array) -> None:
     """Write TUM lines, stamps and values with nine decimals."""
     lines = (tum_line(t, T) + "\n" for t, T in zip(t_ns, T_world_body, strict=True))
-    with replacing(Path(path)) as temporary, temporary.open("w", encoding="ascii", newline="\n") as file:
+    with replacing(Path(path), TUM) as temporary, temporary.open("w", encoding="ascii", newline="\n") as file:
         file.writelines(lines)
 
 

@@ -10,7 +10,7 @@ from datetime import datetime, timezone
 from html import escape
 from typing import Any
 
-from gpvo.files import markdown_table
+from gpvo.files import markdown_table, templates
 
 _PANELS = {"translation_m": "translation [mm]", "rotation_rad": "rotation [mrad]"}
 _COLOURS = (
@@ -54,12 +54,9 @@ def model_card(header: Mapping[str, Any], table: Mapping[str, Any], name: str) -
 
 
 def _filled(template: str, **values: Any) -> str:
-    from jinja2 import Environment, PackageLoader, StrictUndefined
+    from jinja2 import StrictUndefined
 
-    loader = PackageLoader("gpvo.learning")
-    environment = Environment(
-        loader=loader, trim_blocks=True, lstrip_blocks=True, keep_trailing_newline=True, undefined=StrictUndefined
-    )
+    environment = templates("gpvo.learning", lstrip_blocks=True, keep_trailing_newline=True, undefined=StrictUndefined)
     return environment.get_template(template).render(values)
 
 

@@ -115,7 +115,9 @@ def score(
     known, d = np.isfinite(covariance).all(axis=(1, 2)), covariance.shape[-1]
     if known.sum() < 2:
         return empty()
-    error, mean, covariance, whole = error[known], mean[known], covariance[known], d == 6
+    if not known.all():  # else as they are: copies of a long run take hundreds of megabytes
+        error, mean, covariance = error[known], mean[known], covariance[known]
+    whole = d == 6
     counted = counted_axes(axes, d)
     per_block = nees_by_block((error - mean)[:, :d], covariance, counted)
     residual, covariance = (error - mean)[:, counted], marginal(covariance, counted)

@@ -10,7 +10,7 @@ from pathlib import Path
 
 from gpvo.dataset.table import CHUNK_ROWS, StoredSets, read_sets, write_sets
 from gpvo.errors import ModelError
-from gpvo.files import is_writable, write_text
+from gpvo.files import refuse_foreign, write_text
 from gpvo.io.run_read import Run
 from gpvo.learning.card import model_card, stated_against_actual
 from gpvo.learning.config import TrainConfig
@@ -38,17 +38,20 @@ def folds_path(model: Path) -> Path:
     return model.with_name(f".{model.name}.folds")
 
 
-def check_writable(path: Path) -> None:
-    """Make the folder of ``path``. Raise ModelError, before any work, if no model can be written there."""
-    if path.is_dir() or not is_writable(path):
-        raise ModelError("cannot be written", where=path, cure="name a file in a writable folder")
+def refuse_foreign_model(path: Path) -> None:
+    """Raise OutputError, before any work, where no model, or nothing of what lies beside it, can be written: see
+    :func:`gpvo.files.refuse_foreign`."""
+    refuse_foreign(path, modelfile.KIND.encode(), "model")
+    refuse_foreign(card_path(path), rb"trained on .{10} with gpvo", "model card")
+    refuse_foreign(picture_path(path), b'font-family="system-ui, sans-serif" font-size="12"', "model's picture")
+    refuse_foreign(rows_path(path), rb"\APAR1", "training rows")
 
 
 def save_model(trained: TrainedModel, path: str | Path) -> None:
     """``path``, ``path.md`` with its picture ``path.svg``, and ``path.rows.parquet``; each whole or not at all. Kept
     folds are then deleted."""
     path = Path(path)
-    check_writable(path)
+    refuse_foreign_model(path)
     write_sets(rows_path(path), trained.sets)
     picture = stated_against_actual(trained.table.get("folds", ()))
     if picture is None:

@@ -160,7 +160,6 @@ def _kept_fold(held_out: TrainingSet, train_on: Sequence[TrainingSet], config: T
     model = fold_model(held_out, train_on, config, config.keep)
     path = model.with_suffix(".json")
     if not path.is_file():
-        path.parent.mkdir(exist_ok=True)
         write_json(path, _fold(held_out, train_on, config, model))
     return read_json(path)
 

@@ -322,7 +322,7 @@ class Engine:
         T, C, resets = last.T_odom_body, last.pose_covariance, last.reset_counter
         kept = KeptState(T, C, self._scale, self.predictor.digest, resets, last.t_ns, self._twist)
         try:
-            write_json(path, {"schema": 1, **vars(kept)})  # whole or not at all
+            write_json(path, {"schema": 1, **vars(kept)}, (b'"T_odom_body"', "state"))
         except GpvoError as error:
             self._warn(f"the state is not saved: {error}")
 

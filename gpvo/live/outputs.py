@@ -12,7 +12,7 @@ from pathlib import Path
 from typing import Any, Protocol
 
 from gpvo.errors import GpvoError
-from gpvo.files import is_writable
+from gpvo.files import refuse_foreign
 from gpvo.io.bag_reader import ODOMETRY_TYPE, POSE_TYPE
 from gpvo.live.engine import Health, Output
 from gpvo.publish import ros
@@ -135,8 +135,7 @@ class FileOutput(Output):
         if path.suffix.lower() not in ("", ".bag", ".mcap"):
             cure = "end it in .bag or .mcap, or name a folder"
             raise GpvoError("its suffix does not tell what to write", where=path, cure=cure)
-        if not is_writable(path):
-            raise GpvoError("cannot be written", where=path, cure="name a file in a writable folder")
+        refuse_foreign(path, b"", "bag")
         self._path, self._topic, self._folder = path, topic, path.with_name(f"{path.name}.parts")
         self._part: list[Odometry] = []
         self._begun_s, self._count = time.monotonic(), 0

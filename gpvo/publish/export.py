@@ -60,7 +60,7 @@ def export_model(model: Path, path: Path, to: str, *, prefix: str = PREFIX) -> N
     a prefix that is no C identifier, a bad file, or where ``path`` holds anything but an earlier export.
     """
     to = format_of(to, path)
-    refuse_foreign(path, _WRITTEN[to], "export")
+    refuse_foreign(path, _WRITTEN[to], "export")  # before the work, not after it
     if prefix != PREFIX and to != "c":
         raise GpvoError(f"{to} has no symbols to prefix with '{prefix}'", cure="give it only with c")
     predictor = Predictor.load(model)

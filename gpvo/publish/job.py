@@ -13,7 +13,7 @@ import numpy as np
 from gpvo.dataset.build import predictions_of
 from gpvo.dataset.check import warn_of_misfits
 from gpvo.errors import GpvoError
-from gpvo.files import write_text
+from gpvo.files import refuse_foreign, write_text
 from gpvo.io.run import Run, read_run
 from gpvo.io.stamps import END_OF_ROS_NS
 from gpvo.online.predictor import Predictor
@@ -22,6 +22,7 @@ from gpvo.publish.odometry import Odometry, OdometryBuilder, messages
 from gpvo.types import Prediction
 
 TARGETS = ("bag", "mcap", "mavlink")
+_PARAMETERS = (b"^# robot_localization fed by gpvo", "file of parameters")
 _SUFFIXES = {".bag": "bag", ".mcap": "mcap", ".tlog": "mavlink"}
 
 
@@ -73,6 +74,10 @@ def publish_run(path: Path, settings: PublishSettings) -> Published:
     settings = replace(settings, to=_target(settings))
     _require(settings)
     run = read_run(path)
+    if settings.to is not None and settings.link is None:
+        name = f"{run.name}.tlog" if settings.to == "mavlink" else f"{run.name}_{settings.to}"
+        settings = replace(settings, out=settings.out or Path(name))
+        _refuse_other(settings)  # before the work, not after it
     model = settings.model
     predictor = None if model is None else Predictor.load(model).require_motions(model)
     warn_of_misfits(model, predictor, run)
@@ -140,23 +145,39 @@ def _check_stamps(run: Run, odometry: Sequence[Odometry], settings: PublishSetti
         raise GpvoError(f"has stamps {when}", where=run.path, cure="subtract an offset from the stamps of its source")
 
 
+def _kind(settings: PublishSettings, out: Path) -> str:
+    return "mcap" if settings.to == "mcap" else "ros1" if out.suffix.lower() == ".bag" else "sqlite3"
+
+
+def _parameters(bag: Path) -> Path:
+    return bag.with_name(f"{bag.stem}_robot_localization.yaml")
+
+
+def _refuse_other(settings: PublishSettings) -> None:
+    """Raise GpvoError where what is to be written would replace somebody's, or cannot be written."""
+    assert settings.out is not None
+    if settings.to == "mavlink":
+        refuse_foreign(settings.out, *mavlink.TLOG)
+    else:
+        ros.refuse_other(settings.out, settings.topic, _kind(settings, settings.out))
+        refuse_foreign(_parameters(settings.out), *_PARAMETERS)
+
+
 def _write(run: Run, odometry: Sequence[Odometry], settings: PublishSettings) -> tuple[str, int]:
     _check_stamps(run, odometry, settings)
     if settings.link is not None:
         return settings.link, _replay(odometry, mavlink.Link(settings.link, settings.system))
+    out = settings.out
+    assert out is not None
     if settings.to == "mavlink":
-        out = settings.out or Path(f"{run.name}.tlog")
         return str(out), mavlink.write_tlog(out, odometry, system=settings.system)
     if all(o.twist_body is None for o in odometry):
         raise GpvoError("no frame has a motion: nothing to put into a bag", where=run.path)
-    kind = settings.to
-    out = settings.out or Path(f"{run.name}_{kind}")
-    ros1 = kind == "bag" and out.suffix.lower() == ".bag"
-    count = ros.write_bag(out, odometry, settings.topic, "mcap" if kind == "mcap" else "ros1" if ros1 else "sqlite3")
+    kind = _kind(settings, out)
+    count = ros.write_bag(out, odometry, settings.topic, kind)
     rate_hz = 1.0 / float(np.median(np.diff([o.t_ns for o in odometry])) * 1e-9)
-    parameters = out.with_name(f"{out.stem}_robot_localization.yaml")
-    text = ros.robot_localization_yaml(settings.topic, rate_hz=max(30.0, rate_hz), ros1=ros1)
-    write_text(parameters, text)
+    text = ros.robot_localization_yaml(settings.topic, rate_hz=max(30.0, rate_hz), ros1=kind == "ros1")
+    write_text(_parameters(out), text, own=_PARAMETERS)
     return str(out), count
 
 

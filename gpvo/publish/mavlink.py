@@ -171,13 +171,14 @@ class Sender:
         return packed
 
 
+TLOG = (rb"\A.{8}\xfd\x09.{3}[^\x00]\xc5\x00\x00\x00", "telemetry log")
+"""It begins with a time and the heartbeat of a component that sees (197), where an autopilot's own log has another."""
+
+
 def write_tlog(path: Path, odometry: Iterable[Odometry], *, system: int = 1) -> int:
     """Write a telemetry log: every message after its time, 8 bytes big-endian microseconds. Returns frames."""
-    if path.is_dir():
-        raise GpvoError("is a folder, and a telemetry log is a file", where=path, cure="choose another -o")
-    path.parent.mkdir(parents=True, exist_ok=True)
     sender, count = Sender(system), 0
-    with replacing(path) as temporary, temporary.open("wb") as file:
+    with replacing(path, TLOG) as temporary, temporary.open("wb") as file:
         for item in odometry:
             for message in sender.due(item):
                 file.write(struct.pack(">Q", item.t_ns // 1000) + message)

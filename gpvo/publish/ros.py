@@ -24,6 +24,7 @@ from rosbags.rosbag2 import Writer as Ros2Writer
 from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
 from gpvo.errors import GpvoError
+from gpvo.files import make_folder
 from gpvo.geometry import se3
 from gpvo.io.bag_reader import open_bag
 from gpvo.publish.mavlink import flu, frd, quality
@@ -104,14 +105,19 @@ def _kind(path: Path) -> str:
     return {".bag": "ros1", ".mcap": "mcap"}.get(path.suffix.lower(), "sqlite3")
 
 
-def _write(path: Path, messages: Iterable[tuple[int, bytes]], topic: str, kind: str) -> int:
+def refuse_other(path: Path, topic: str, kind: str) -> None:
+    """Raise GpvoError where something else than a bag of ``topic`` alone lies."""
     if kind != "ros1" and path.is_file():
         raise GpvoError("is a file, and a ROS 2 bag is a folder", where=path, cure="choose another -o")
     if path.exists() and not _holds_only(path, topic):
         raise GpvoError(f"exists, and is not a bag of {topic} alone", where=path, cure="choose another -o")
+
+
+def _write(path: Path, messages: Iterable[tuple[int, bytes]], topic: str, kind: str) -> int:
+    refuse_other(path, topic, kind)
     holder: Path | None = None
     try:
-        path.parent.mkdir(parents=True, exist_ok=True)
+        make_folder(path.parent)
         holder = Path(tempfile.mkdtemp(prefix=f".{path.name}.", dir=path.parent))
         # A bag's files carry its name inside, so the temporary one has the same name in a folder of its own.
         count = _fill(holder / path.name, messages, topic, kind)

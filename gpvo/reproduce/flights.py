@@ -11,12 +11,12 @@ import numpy as np
 
 from gpvo import __version__, runner
 from gpvo.errors import GpvoError, OutputError
-from gpvo.files import write_text
+from gpvo.files import digest_of_file, write_text
 from gpvo.io import open_source
 from gpvo.io.run import is_finished
 from gpvo.io.trajectory import read_euroc_csv, read_tum, tum_line
 from gpvo.reproduce.experiments import FLIGHTS, FlightSet, Mode, Plan, sigma_pairs
-from gpvo.reproduce.stages import Store, Workers, digest_of, digest_of_file
+from gpvo.reproduce.stages import Store, Workers, digest_of
 from gpvo.sim.scenario import Scenario, load_scenario
 from gpvo.sim.scenario import fly as simulate
 from gpvo.vo.config import make_config

@@ -18,6 +18,7 @@ from numpy.typing import NDArray
 from gpvo import __version__, runner
 from gpvo.dataset.build import leave_one_out
 from gpvo.errors import GpvoError, OutputError
+from gpvo.files import digest_of_file
 from gpvo.io import open_source
 from gpvo.io.foreign import read_foreign
 from gpvo.io.run import is_finished, write_run
@@ -26,7 +27,7 @@ from gpvo.io.trajectory import check_overlap
 from gpvo.reproduce.bounds import Bounds, BoundsJob, job_of, load_bounds, method_of
 from gpvo.reproduce.experiments import EXPERIMENTS, WAYS, Experiment, Mode, Plan, Way, printed
 from gpvo.reproduce.flights import Flights
-from gpvo.reproduce.stages import Store, Workers, digest_of, digest_of_file
+from gpvo.reproduce.stages import Store, Workers, digest_of
 from gpvo.stats.series import bootstrap_over
 from gpvo.types import Array, TruthLog, VoLog
 from gpvo.vo.config import make_config

@@ -7,12 +7,19 @@ from pathlib import Path
 from typing import Any
 
 from gpvo import __version__
-from gpvo.files import plain, write_csv, write_json, write_text
+from gpvo.files import plain, refuse_foreign, write_csv, write_json, write_text
 from gpvo.reproduce import models, rows, tables
 from gpvo.reproduce.claims import claims
 from gpvo.reproduce.experiments import ERRATA, OUT_OF_SCOPE, WAYS, Plan
 from gpvo.reproduce.flights import fly_all
 from gpvo.reproduce.stages import Store, Workers, only_user
+
+_WRITTEN = {
+    "results.json": (b'"out_of_scope"', "results of a reproduction"),
+    "tables.md": (b"^# The thesis' experiments, reproduced", "tables of a reproduction"),
+    "tables.csv": (b",thesis_", "tables of a reproduction"),
+    "report.html": (b"<title>gpvo: the thesis reproduced</title>", "report of a reproduction"),
+}
 
 
 def reproduce(plan: Plan, out: Path, workers: Workers | None = None) -> dict[str, Any]:
@@ -21,6 +28,8 @@ def reproduce(plan: Plan, out: Path, workers: Workers | None = None) -> dict[str
     Writes ``results.json`` (the returned document, schema 1), ``tables.md``, ``tables.csv``, ``figures/*.png`` and
     ``report.html`` into ``out``. Raises GpvoError where the folder cannot be written, or the folder of data is missing.
     """
+    for name, own in _WRITTEN.items():
+        refuse_foreign(out / name, *own)  # before the work, not after it
     with only_user(out):
         result = _computed(plan, out, workers or Workers())
         document = plain(result)

@@ -24,11 +24,6 @@ def digest_of(*parts: Any) -> str:
     return hashlib.sha256(text.encode()).hexdigest()[:_LENGTH]
 
 
-def digest_of_file(path: Path) -> str:
-    """Short SHA-256 of a file's bytes."""
-    return hashlib.sha256(path.read_bytes()).hexdigest()[:_LENGTH]
-
-
 @dataclass(frozen=True)
 class Store:
     """A folder of stages: ``paths``, ``flights`` (on their way to odometry), ``runs``, ``models``, ``bounds`` and

@@ -13,7 +13,7 @@ from matplotlib.figure import Figure
 
 from gpvo.evaluation.panels import line, panel
 from gpvo.evaluation.plots import figure_of, save
-from gpvo.files import columns_of, make_folder, markdown_table
+from gpvo.files import columns_of, make_folder, markdown_table, templates
 from gpvo.reproduce.bounds import Bounds
 from gpvo.reproduce.models import Studies
 from gpvo.reproduce.rows import Cell
@@ -86,11 +86,7 @@ def as_markdown(document: Mapping[str, Any]) -> str:
 
 def as_page(document: Mapping[str, Any], folder: Path) -> str:
     """All tables and figures of the document as HTML; images are read from ``folder``."""
-    from jinja2 import ChoiceLoader, Environment, PackageLoader, select_autoescape
-
-    # The style sheet is that of the other pages.
-    loader = ChoiceLoader([PackageLoader("gpvo.reproduce"), PackageLoader("gpvo.evaluation")])
-    environment = Environment(loader=loader, autoescape=select_autoescape(default=True), trim_blocks=True)
+    environment = templates("gpvo.reproduce", "gpvo.evaluation")  # the style sheet is that of the other pages
     environment.filters["number"] = number
 
     def embedded(file: str) -> str:

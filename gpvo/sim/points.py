@@ -65,10 +65,11 @@ class PointsFlight:
             "imu_noise": np.array(astuple(noise)),
             "episodes_s": np.array([[e.begin_s, e.end_s] for e in self.episodes]).reshape(-1, 2),
         }  # fmt: skip
-        write_arrays(target, arrays)
+        write_arrays(target, arrays, TRACKS)
         return target
 
 
+TRACKS = (rb"episodes_s\.npy", "flight without images")
 # The camera looks forward from the nose, level.
 T_BODY_CAM = se3.from_rt(R_FLU_OPTICAL, np.array([0.12, 0.0, 0.02]))
 

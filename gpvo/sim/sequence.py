@@ -9,6 +9,8 @@ import hashlib
 import json
 import os
 import shutil
+import struct
+import zlib
 from collections.abc import Callable, Iterator
 from concurrent.futures import Future, ThreadPoolExecutor
 from contextlib import contextmanager
@@ -24,7 +26,7 @@ from numpy.typing import NDArray
 from gpvo.cameras.models import CameraModel
 from gpvo.cameras.rig import StereoRig
 from gpvo.errors import GpvoError, OutputError
-from gpvo.files import FolderLock, make_folder, replacing, to_toml, write_json
+from gpvo.files import FolderLock, digest_of_file, make_folder, replacing, to_toml, write_json
 from gpvo.geometry import se3
 from gpvo.geometry.se3 import path_length_m
 from gpvo.io.images import read_grey8
@@ -42,6 +44,8 @@ START_NS = 1_600_000_000_000_000_000
 _PNG = [cv2.IMWRITE_PNG_COMPRESSION, 1]
 _AHEAD = 16
 _WIDTH_PX = 320  # of an image on the contact sheet
+_HEAD_BYTES = 33  # of a PNG: its signature, and the size of the image
+SHEET = (b"Software\x00gpvo simulate", "contact sheet")  # the text is a PNG's own way to say so
 _CAMERA_HEAD = "#timestamp [ns],filename"
 _IMU_HEAD = (
     "#timestamp [ns],w_RS_S_x [rad s^-1],w_RS_S_y [rad s^-1],w_RS_S_z [rad s^-1],"
@@ -97,7 +101,7 @@ def _digests(scenario: Scenario) -> dict[str, dict[str, str]]:
     path = Path(scenario.trajectory or "")
     recorded = path / "vo_log.parquet" if path.is_dir() else path
     if scenario.trajectory and recorded.is_file():
-        files["trajectory"] = hashlib.sha256(recorded.read_bytes()).hexdigest()
+        files["trajectory"] = digest_of_file(recorded)
     return {"files": files} if files else {}
 
 
@@ -312,6 +316,8 @@ def contact_sheet(sequence: Path, out: Path) -> None:
             small.append(cv2.resize(image, (_WIDTH_PX, round(image.shape[0] * _WIDTH_PX / image.shape[1]))))
         tiles.append(np.pad(np.hstack(small), 2, constant_values=255))
     sheet = np.vstack([np.hstack(tiles[k : k + 2]) for k in (0, 2, 4)])
-    make_folder(out.parent)
-    with replacing(out) as temporary:
-        temporary.write_bytes(cv2.imencode(".png", sheet)[1].tobytes())
+    png = cv2.imencode(".png", sheet)[1].tobytes()
+    text = b"tEXt" + SHEET[0]
+    signed = struct.pack(">I", len(text) - 4) + text + struct.pack(">I", zlib.crc32(text))
+    with replacing(out, SHEET) as temporary:
+        temporary.write_bytes(png[:_HEAD_BYTES] + signed + png[_HEAD_BYTES:])

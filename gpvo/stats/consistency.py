@@ -78,8 +78,9 @@ def counted_axes(axes: ArrayLike | None, d: int) -> NDArray[np.intp]:
 
 
 def marginal(covariance: Array, axes: ArrayLike) -> Array:
-    """Covariances (..., k, k) of some of the axes of (..., d, d)."""
-    return np.asarray(covariance)[..., np.asarray(axes)[:, None], np.asarray(axes)]
+    """Covariances (..., k, k) of some of the axes of (..., d, d); of all of them, in order, no copy."""
+    C, chosen = np.asarray(covariance), np.asarray(axes)
+    return C if np.array_equal(chosen, np.arange(C.shape[-1])) else C[..., chosen[:, None], chosen]
 
 
 def nees_by_block(error: Array, covariance: Array, axes: ArrayLike | None = None) -> dict[str, Array]:

@@ -12,9 +12,10 @@ from typing import Any, TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
-from gpvo.types.records import Columns, Status, VoRecord
+from gpvo.types.records import Columns, Status, VoLog
 from gpvo.types.sensors import Array
 
+_SAME_S = 1e-6
 _AT_ONCE = 1000  # predictions as objects
 _MOST_PERSISTENT = 12
 _Error = TypeVar("_Error", bound="MotionError")
@@ -113,10 +114,6 @@ class Prediction(MotionError):
     confidence: float | Array
     in_domain: float | Array
 
-    def is_of(self, record: VoRecord) -> bool:
-        """Whether it speaks of the record's own motion, not of a window of motions that ends there."""
-        return self.t_ns == record.t_ns and abs(float(self.dt_s) - record.dt_s) < 1e-6
-
 
 @dataclass(frozen=True, eq=False)
 class StoredPredictions(Columns[Prediction]):
@@ -132,18 +129,30 @@ class StoredPredictions(Columns[Prediction]):
         """Predictions as they come: a thousand at a time are objects."""
         if isinstance(predictions, StoredPredictions):
             return predictions
-        coming, parts = iter(predictions), list[StoredPredictions]()
+        coming, parts = iter(predictions), dict[str, list[NDArray[Any]]]()
         while (some := list(islice(coming, _AT_ONCE))) or not parts:
             columns = {f.name: [getattr(p, f.name) for p in some] for f in fields(Prediction)}
             columns["persistent_root"] = [_wide(root, 0.0) for root in columns["persistent_root"]]
             columns["persistent_tau_s"] = [_wide(tau_s, 1.0) for tau_s in columns["persistent_tau_s"]]
-            parts.append(cls({name: _column(name, values) for name, values in columns.items()}))
-        return cls.join(parts)
+            for name, values in columns.items():
+                parts.setdefault(name, []).append(_column(name, values))
+        # The parts of a column are let go once it is joined: two of each would be what a long run takes at most.
+        joined = {name: np.concatenate(parts.pop(name)) for name in tuple(parts)}
+        tau_s = joined["persistent_tau_s"]
+        if len(tau_s) and (tau_s == tau_s[0]).all():  # as of one model
+            joined["persistent_tau_s"] = np.broadcast_to(tau_s[0].copy(), tau_s.shape)
+        return cls(joined)
 
     def made(self, k: int) -> Prediction:
         """Prediction k."""
         of_one = {name: column.item(k) if column.ndim == 1 else column[k] for name, column in self.columns.items()}
         return Prediction(**of_one)
+
+    def batch(self, rows: NDArray[np.int64]) -> MotionError:
+        """Some of them as one, of one time constant each and of no status."""
+        names = ("mean", "jitter", "white", "persistent_root", "persistent_tau_s", "dt_s")
+        of: dict[str, Any] = {name: self.columns[name][rows] for name in names}
+        return MotionError(**of)
 
 
 _SHAPES = {"persistent_root": (6, _MOST_PERSISTENT), "persistent_tau_s": (_MOST_PERSISTENT,)}
@@ -179,6 +188,14 @@ class ByStamp(Mapping[int, Prediction]):
     def only(self, t_ns: Iterable[int]) -> ByStamp:
         """Those of some stamps."""
         return ByStamp(self.stored, {t: self._rows[t] for t in t_ns})
+
+    def rows_of(self, log: VoLog) -> NDArray[np.int64]:
+        """(N,) row of ``stored`` for each motion of a log; -1 where nothing is said of it, or of a window of motions
+        that ends there alone."""
+        row = np.array([self._rows.get(t, -1) for t in log.t_ns.tolist()], dtype=np.int64)
+        said = row >= 0
+        said[said] = np.abs(self.stored.columns["dt_s"][row[said]] - log.column("dt_s")[said]) < _SAME_S
+        return np.where(said, row, -1)
 
     def __getitem__(self, t_ns: int) -> Prediction:
         return self.stored.made(self._rows[t_ns])

@@ -293,9 +293,10 @@ class VoLog:
         maps = (getattr(self.records, f.name) for f in fields(StoredRecords))
         return replace(self, records=StoredRecords(*({name: c[keep] for name, c in m.items()} for m in maps)))
 
-    def trajectory(self) -> Array:
-        """(N, 4, 4) ``T_first_cam``: the motions compounded, never corrected by a model."""
-        T, parent = self.T_prev_cur, self.parent
+    def trajectory(self, T_prev_cur: Array | None = None) -> Array:
+        """(N, 4, 4) ``T_first_cam``: the motions compounded, never corrected by a model; or others (N, 4, 4) in their
+        place."""
+        T, parent = self.T_prev_cur if T_prev_cur is None else T_prev_cur, self.parent
         out = np.empty_like(T)
         for k in range(len(T)):
             out[k] = T[k] if parent[k] < 0 else out[parent[k]] @ T[k]

@@ -237,8 +237,12 @@ def rig_of(calibration: dict[str, Any] | None, camera: StereoCamera) -> StereoRi
         raise CalibrationError(f"is malformed: {error}", where="rig.json") from None
 
 
+CAMCHAIN = (b"^# written by gpvo calibration", "corrected calibration")
+
+
 def camchain(rig: StereoRig) -> str:
-    """The rig as Kalibr's ``camchain.yaml``, with the place and the clock of the IMU where they are known."""
+    """The rig as Kalibr's ``camchain.yaml``, with the place and the clock of the IMU where they are known. Its first
+    line tells it from Kalibr's own."""
     chain: dict[str, dict[str, Any]] = {}
     for name, lens, T_cam_left in (("cam0", rig.left, np.eye(4)), ("cam1", rig.right, rig.T_right_left)):
         chain[name] = {
@@ -253,4 +257,5 @@ def camchain(rig: StereoRig) -> str:
         if rig.timeshift_cam_imu_s:
             chain[name]["timeshift_cam_imu"] = rig.timeshift_cam_imu_s
     chain["cam1"]["T_cn_cnm1"] = rig.T_right_left
-    return str(yaml.safe_dump(plain(chain), sort_keys=False, default_flow_style=None, width=math.inf))
+    text = yaml.safe_dump(plain(chain), sort_keys=False, default_flow_style=None, width=math.inf)
+    return f"# written by gpvo calibration\n{text}"

@@ -159,7 +159,7 @@ def test_what_cannot_be_forecast_is_one_line(tmp_path, model_file):
         (("--path", tmp_path / "short.tum"), "lasts less"),
         (("--path", tmp_path / "plan.tum", "--frame", "imu"), "imu"),
         (("--path", tmp_path / "plan.tum", "-o", tmp_path / "x.txt"), "x.txt"),
-        (("--path", tmp_path / "plan.tum", "-o", tmp_path / "no" / "x.csv"), "x.csv"),
+        (("--path", tmp_path / "plan.tum", "-o", tmp_path / "plan.tum" / "x.csv"), "plan.tum is no folder"),
         (("--path", tmp_path / "none.tum", "--plot", tmp_path / "x.txt"), "not have the suffix of an image"),
     ]
     for args, says in cases:

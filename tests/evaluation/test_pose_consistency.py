@@ -124,6 +124,6 @@ def test_it_shows_by_how_much_a_statement_is_wrong() -> None:
 
 def test_covariances_of_poses_are_no_statement_of_motions() -> None:
     log, _, _ = filtered(0)
-    assert statements(log) == []
+    assert not statements(log)
     plain, _ = make_run(20)
     assert pose_consistency(plain, np.empty((0, 4, 4)), np.empty((0, 4, 4)), np.ones(21, bool)) is None

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import json
+import os
+import time
 import warnings
 from collections.abc import Callable
 from functools import partial
@@ -121,6 +123,41 @@ def test_the_same_bytes_after_breaking_off_twice(
     fly("broken")
     assert len(begun) == total - 12  # from the fourth chunk on: the 12th record came before it broke off
     assert content(tmp_path / "broken") == content(tmp_path / "whole")
+
+
+@pytest.mark.parametrize("way", ["in place", "another file"])
+def test_new_content_of_the_same_size_and_time_begins_anew(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, way: str
+) -> None:
+    """As when a calibration or recording is mended by a tool that sets times back: half is of the old."""
+    monkeypatch.setattr(runner, "RunWriter", partial(RunWriter, chunk=5))
+    path, went, before = tracks(tmp_path), [], time.time_ns()
+    step = StereoOdometry.step
+    monkeypatch.setattr(StereoOdometry, "step", lambda *a: (went.append(True), step(*a))[1])
+
+    def fly() -> None:
+        went.clear()
+
+        def on_frame(*_: object) -> None:
+            if len(went) == 13:
+                raise KeyboardInterrupt
+
+        runner.run(open_source(path), tmp_path / "run", on_frame=on_frame, options={})
+
+    with pytest.raises(KeyboardInterrupt):
+        fly()
+    while time.time_ns() - before < 5e7:  # a clock of files may tick a hundred times a second
+        time.sleep(0.01)
+    was, blob = path.stat(), bytearray(path.read_bytes())
+    blob[10] ^= 1  # the time of its first member, which nobody reads
+    if way == "another file":
+        path.unlink()
+    path.write_bytes(blob)
+    os.utime(path, ns=(was.st_atime_ns, was.st_mtime_ns))
+    assert (path.stat().st_size, path.stat().st_mtime_ns) == (was.st_size, was.st_mtime_ns)
+    with pytest.raises(KeyboardInterrupt):
+        fly()
+    assert len(went) == 13
 
 
 def test_another_source_setting_or_code_begins_anew(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

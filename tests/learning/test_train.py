@@ -16,7 +16,7 @@ from gpvo.cli.learn import _print_table, _train
 from gpvo.dataset.build import TrainingSet, build, build_run
 from gpvo.dataset.check import check, odometry_problems
 from gpvo.dataset.table import read_sets, write_sets
-from gpvo.errors import GpvoError, ModelError
+from gpvo.errors import GpvoError, ModelError, OutputError
 from gpvo.evaluation.evaluate import evaluate_run
 from gpvo.evaluation.verdict import verdict
 from gpvo.geometry import se3
@@ -656,8 +656,8 @@ def test_the_folder_of_a_model_is_made_and_one_that_cannot_be_is_named(tmp_path:
     save_model(_of_three(), tmp_path / "new" / "m.gpvo")
     assert (tmp_path / "new" / "m.gpvo").is_file()
     (tmp_path / "file").write_text("")
-    for path in (tmp_path / "file" / "m.gpvo", tmp_path / "new"):
-        with pytest.raises(ModelError, match="cannot be written"):
+    for path, told in ((tmp_path / "file" / "m.gpvo", "cannot be written"), (tmp_path / "new", "new: is a folder")):
+        with pytest.raises(OutputError, match=told):
             save_model(_of_three(), path)
 
 

@@ -305,7 +305,10 @@ def test_predictions_go_to_parquet_alone(tmp_path: Path) -> None:
 def test_predictions_where_something_else_is(tmp_path: Path) -> None:
     (tmp_path / "d.parquet").mkdir()
     (tmp_path / "f.parquet").touch()
-    for runs, name, message in ((["a"], "d", "is a folder .*parquet"), (["a", "b"], "f", "is a file .*give a folder")):
+    for runs, name, message in (
+        (["a"], "d", "d.parquet: is a folder .*name a file"),
+        (["a", "b"], "f", "is a file .*give a folder"),
+    ):
         words = ["predict", "m.gpvo", *runs, "-o", str(tmp_path / f"{name}.parquet")]
         with pytest.raises(GpvoError, match=message):
             CliRunner().invoke(app, words, catch_exceptions=False)

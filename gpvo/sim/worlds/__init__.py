@@ -263,7 +263,6 @@ def _save_world(world: World, path: Path) -> None:
     for part in _PARTS:
         if (whole := getattr(world, part)) is not None:
             arrays |= {f"{part}.{name}": value for name, value in vars(whole).items()}
-    path.parent.mkdir(parents=True, exist_ok=True)
     with replacing(path) as temporary, temporary.open("wb") as file:
         np.savez(file, **arrays)
 
