@@ -295,7 +295,8 @@ def held(footage: stress.Footage) -> dict[str, stress.Outcome]:
     found = {fault: stress.run(change(footage)) for fault, change in stress.HELD.items()}
     for fault, o in found.items():
         share = np.median(o.error_m[1:] / o.moved_m[1:])
-        print(f"{fault:24s} ok and wrong {len(o.silent):2d}, wrong {len(o.wrong):2d} of {len(o.records) - 1}, {share:.3f}")
+        n = len(o.records) - 1
+        print(f"{fault:24s} ok and wrong {len(o.silent):2d}, wrong {len(o.wrong):2d} of {n}, {share:.3f}")
     return found
 
 
