@@ -53,7 +53,9 @@ def statements(
     out: list[Statement] = []
     arrays = predictor.arrays if predictor is not None else {}
     covariances = {m: where_stated(log.covariance(m)) for m in log.methods if m != IMPORTED_POSE}
-    v_t = {m: _translation_alone(log, m) for m in covariances}
+    # V_T is in the axes of the reference camera, the error in those of the current one.
+    R = log.T_prev_cur[:, :3, :3]
+    v_t = {m: where_stated(np.swapaxes(R, 1, 2) @ log.v_t(m) @ R) for m in covariances}
     for method, C in simple_covariances(arrays, covariances, v_t, len(log)).items():
         if method == "constant":
             C = C * _frames_bridged(log)[:, None, None]
@@ -120,13 +122,6 @@ class _Rows(Sequence[MotionError]):
         if not -self.n <= k < self.n:
             raise IndexError(k)
         return self.made(k)
-
-
-def _translation_alone(log: VoLog, method: str) -> Array:
-    """(N, 3, 3) covariance of the translation."""
-    # V_T is in the axes of the reference camera, the error in those of the current one.
-    R = log.T_prev_cur[:, :3, :3]
-    return where_stated(np.swapaxes(R, 1, 2) @ log.v_t(method) @ R)
 
 
 def predicted_statement(method: str, log: VoLog, predictions: Mapping[int, Prediction]) -> Statement:
