@@ -169,7 +169,6 @@ def _most_likely(model: ErrorModel, of: _Residuals, divided: Sequence[_Divided])
 
 
 def _consistent(model: ErrorModel, of: _Residuals, divided: _Divided) -> _Consistent:
-    """The model, calibrated for poses and for all six axes jointly."""
     whole, joint, poses = _jointly(of, divided)
     added = added_factor(poses, divided.whole.share)
     if added != 1.0:

@@ -123,7 +123,6 @@ class OdometryBuilder:
         return self._message(record, prediction, chain, twist, twist_covariance)
 
     def _error(self, record: VoRecord, prediction: Prediction | None) -> MotionError:
-        """What is stated of a measured motion."""
         if prediction is not None:
             if not is_positive_definite(prediction.covariance):
                 raise GpvoError(f"the prediction at t_ns {record.t_ns} is not symmetric positive definite")
@@ -139,11 +138,8 @@ class OdometryBuilder:
         return MotionError.independent(covariance, dt_s=record.dt_s)
 
     def _twist(self, record: VoRecord, error: MotionError, chain: _Chain) -> tuple[Array, Array]:
-        """Body twist since the last good frame, and its covariance.
-
-        Usually that frame is the reference. Where it is not (the vehicle stood still, or a keyframe is kept), the
-        motion is the difference of two motions from one reference, whose noise cancels; both frames' noise remains.
-        """
+        """Body twist since the last good frame, and its covariance. Where that frame is not the reference (the vehicle
+        stood still, or a keyframe is kept), the noise of the reference cancels, and that of both frames remains."""
         t_last = record.t_prev_ns if self._last is None else self._last[0].t_ns
         dt = (record.t_ns - t_last) * 1e-9
         if dt <= 0:
