@@ -6,7 +6,7 @@ import numpy as np
 
 from gpvo.dataset.build import TrainingSet
 from gpvo.learning.rows import Rows
-from gpvo.online.base import COASTED, TWIST_COLUMNS, Velocities
+from gpvo.online.base import COASTED, TWIST_COLUMNS
 from gpvo.online.guard import Domain
 from gpvo.stats.student_t import NU, log_fisher, log_scale_score, negative_log_likelihood
 from gpvo.types import Array
@@ -63,11 +63,6 @@ def _scoring_step(X: Array, square: Array, count: Array, theta: Array) -> Array:
     step = np.asarray(np.linalg.solve(information, score[..., None])[..., 0])
     gain = 0.5 * (step * score).sum(axis=1, keepdims=True)
     return np.where(gain > 0.01 * _ENOUGH, step, 0.0)
-
-
-def learn_velocities(rows: Rows) -> Velocities:
-    """Of all sequences alike."""
-    return Velocities(usual_rate_var(rows), rate_changes(rows))
 
 
 def usual_rate_var(rows: Rows) -> Array:
