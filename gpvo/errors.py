@@ -1,8 +1,11 @@
-"""The errors gpvo raises on purpose: one line each that names the file, the place and the cure."""
+"""The errors gpvo raises on purpose: one line each that names the file, the place and the cure; and the packages beside
+it, which may be absent, or add to it."""
 
 from __future__ import annotations
 
+from collections.abc import Callable, Mapping
 from importlib.util import find_spec
+from typing import Any
 
 _EXTRAS = {
     "vo": ("cv2", "yaml"),
@@ -75,3 +78,14 @@ def require(package: str) -> None:
     """Raise MissingExtraError where a package of one of gpvo's extras is not installed."""
     if find_spec(package) is None:
         raise MissingExtraError(package, EXTRA_OF[package])
+
+
+def plugins(group: str, built_in: Mapping[str, str]) -> dict[str, Callable[[], Any]]:
+    """Loaders by name: of what is ``built_in``, each a ``package.module:name``, then of what installed packages add
+    under the entry point ``group``; they cannot take over a built-in name."""
+    from importlib.metadata import EntryPoint, entry_points
+
+    known: dict[str, Callable[[], Any]] = {n: EntryPoint(n, place, group).load for n, place in built_in.items()}
+    for entry in entry_points(group=group):
+        known.setdefault(entry.name, entry.load)
+    return known

@@ -95,15 +95,15 @@ def _on_dask(
             raise GpvoError(_KILLED, cure="run it again, with fewer workers") from None
 
 
-def prefetched(items: Iterable[T], depth: int = 2) -> Iterator[T]:
-    """The same items, made ahead in one background thread; at most ``depth`` wait.
+def prefetched(items: Iterable[T]) -> Iterator[T]:
+    """The same items, made ahead in one background thread; at most two wait.
 
     An exception in the thread is raised here; the thread ends when the consumer stops.
     """
     remaining = iter(items)
     end: Any = object()
     thread = ThreadPoolExecutor(1, "gpvo-decode")
-    ahead = deque(thread.submit(next, remaining, end) for _ in range(depth))
+    ahead = deque(thread.submit(next, remaining, end) for _ in range(2))
     try:
         while (item := ahead.popleft().result()) is not end:
             ahead.append(thread.submit(next, remaining, end))

@@ -97,7 +97,6 @@ def _size(document: dict[str, Any], size: tuple[int, int] | None, path: Path) ->
 
 
 def _stated_size(document: dict[str, Any], path: Path) -> tuple[int, int]:
-    """ROS' ``image_width`` and ``image_height``."""
     width, height = (int(get_numbers(document, key, 1, path)[0]) for key in ("image_width", "image_height"))
     return width, height
 
@@ -136,11 +135,8 @@ _SIDES = (("left", "right"), ("cam0", "cam1"), ("camera0", "camera1"), ("infra1"
 
 
 def _read_camera_infos(path: Path) -> StereoRig:
-    """The rig of ROS camera_info YAML (``camera_calibration_parsers``), a file per camera, for raw images.
-
-    ``path``: of either camera, ``left.yaml`` or ``right.yaml``; the other lies beside it. Raises CalibrationError where
-    the other file is missing, or one of them lacks a matrix.
-    """
+    """The rig of ROS camera_info YAML (``camera_calibration_parsers``) for raw images, a file per camera: ``path`` is
+    either, ``left.yaml`` or ``right.yaml``, and the other lies beside it."""
     for left, right in _SIDES:
         name = path.name.replace(right, left)
         if left in name:

@@ -84,7 +84,6 @@ def _options(group: Any) -> Iterator[inspect.Parameter]:
 
 
 def _made(group: Any, given: dict[str, Any]) -> Any:
-    """The dataclass, of what was given."""
     asked = _asked(group)
     return group(**{name: _made(kind, given) if is_dataclass(kind) else given.pop(name) for name, kind, _ in asked})
 

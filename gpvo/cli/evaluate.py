@@ -98,7 +98,6 @@ def evaluate(
 
 
 def _write_files(e: Evaluation, name: str, *, stated: Path | None, tables: Path | None, plots: Path | None) -> None:
-    """Write to whichever folders are given."""
     if stated is not None:
         from gpvo.evaluation.score import write_statements
 

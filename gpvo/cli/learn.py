@@ -212,6 +212,8 @@ def _train(
 
 
 def _print_table(document: dict[str, Any]) -> None:
+    from gpvo.learning.store import with_interval
+
     if not document["folds"]:
         print("one short run alone: nothing could be left out, so there is no table")
         return
@@ -257,14 +259,9 @@ def _print_table(document: dict[str, Any]) -> None:
         )
     c = document["comparison"]
     if c is not None:
-        say(f"best row by NLL: {c['best_row']}; learned minus {c['rival']}: {_interval(c, 'nll_per_dim_difference')}")
-        say(f"learned minus base (what the Gaussian process adds): {_interval(c, 'learned_less_base')}")
-
-
-def _interval(comparison: dict[str, Any], name: str) -> str:
-    d = comparison[name]
-    interval = "(too few for an interval)" if d["low"] is None else f"[{d['low']:+.3f}, {d['high']:+.3f}]"
-    return f"{d['mean']:+.3f} {interval}"
+        rival, base = (with_interval(c[name]) for name in ("nll_per_dim_difference", "learned_less_base"))
+        say(f"best row by NLL: {c['best_row']}; learned minus {c['rival']}: {rival}")
+        say(f"learned minus base (what the Gaussian process adds): {base}")
 
 
 def _nees(block: dict[str, float | None]) -> float | None:

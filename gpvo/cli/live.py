@@ -106,11 +106,9 @@ def doctor(
 
 
 def _nees_of_bag(bag: Path, topic: str, truth: ForeignLog, align: str) -> dict[str, Any]:
-    """NEES per degree of freedom of the ``poses`` and of the ``motions`` whose covariances a topic states.
-
-    Each is None, or by block of the error {``nees_dof``, ``interval``, ``median``} with the ``count``; ``problem`` is
-    the reason why nothing could be judged. ``truth``: of the same body.
-    """
+    """NEES per degree of freedom of the ``poses`` and of the ``motions`` whose covariances a topic states: None, or by
+    block of the error {``nees_dof``, ``interval``, ``median``} with the ``count``; and the ``problem`` where nothing
+    could be judged. ``truth``: of the same body."""
     from gpvo.evaluation.evaluate import evaluate_run
     from gpvo.evaluation.trajectory import nees_document
 
@@ -127,7 +125,6 @@ def _nees_of_bag(bag: Path, topic: str, truth: ForeignLog, align: str) -> dict[s
 
 
 def _lines(found: dict[str, Any]) -> list[str]:
-    """The same in words, one line for each."""
     if found["problem"]:
         return [f"NEES unknown: {found['problem']}"]
     out = []

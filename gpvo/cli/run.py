@@ -79,7 +79,6 @@ def run(
 
 
 def _tell(out: Path, summary: RunSummary, notes: Sequence[str], json_: bool) -> None:
-    """Print the summary and a few of the source's notes."""
     more = [f"{len(notes) - _MOST_NOTES} more in run.json"] if len(notes) > _MOST_NOTES else []
     for line in (*notes[:_MOST_NOTES], *more):
         note(f"source: {line}")

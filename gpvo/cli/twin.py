@@ -13,7 +13,7 @@ import numpy as np
 import typer
 
 from gpvo.cli.common import is_given
-from gpvo.cli.output import Json, note, print_json, progress, say, show
+from gpvo.cli.output import Json, answer, note, print_json, progress, say, show
 from gpvo.dataset.errors import require_attitude
 from gpvo.errors import GpvoError
 from gpvo.io.run import Run, read_run
@@ -94,10 +94,8 @@ def twin(
             n = settings.replicates
             _print_ratios(real, [made[i : i + n] for i in range(0, len(made), n)], json_)
             return
-    if json_:
-        print_json({"schema": 1, "twins": [str(p) for p in made]})
-    else:
-        print(f"{out}: {len(made)} twins of {len(runs)} run{'s' * (len(runs) != 1)}")
+    told = f"{out}: {len(made)} twins of {len(runs)} run{'s' * (len(runs) != 1)}"
+    answer(json_, {"schema": 1, "twins": [str(p) for p in made]}, lambda: print(told))
 
 
 def _print_ratios(runs: Sequence[Run], twins: Sequence[Sequence[Path]], json_: bool) -> None:

@@ -186,12 +186,9 @@ _ALIKE = 0.5  # squared correlation of the motions
 
 
 def _require_one_unit(log: VoLog, truth: TruthLog, where: object) -> None:
-    """Refuse motions of a second that are another size by odometry than by truth.
-
-    Of two that are noisy, the sum of products over that of squares underrates the scale by the noise of either: it lies
-    between the two. Motions that hardly go together, as noise and the rounding of a truth at rest, are not one motion
-    in two units. Raises GpvoError, naming ``where``.
-    """
+    """Raise GpvoError, naming ``where``, for motions of a second that are another size by odometry than by truth. Of
+    two that are noisy, the sum of products over that of squares underrates the scale by the noise of either; motions
+    that hardly go together, as noise and the rounding of a truth at rest, are not one motion in two units."""
     a, b = (T[:, :3, 3] for T in windowed_motions(log, truth)[:2])
     own, true, both = float((a**2).sum()), float((b**2).sum()), float((a * b).sum())
     if _MOST_SCALE * min(own, true) < both and both**2 > _ALIKE * own * true:

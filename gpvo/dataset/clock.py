@@ -124,11 +124,9 @@ def _correlation(x: Array, y: Array, min_overlap: int) -> Array:
 
 
 def _refine(log: TruthLog, truth: TruthLog, offset_s: float, window: int) -> float:
-    """Minimum of a robust misfit near ``offset_s``, to a fraction of a step: of the parabola through three offsets.
-
-    These are whole steps of the truth apart. Interpolation averages the noise of two poses, most of all midway between
-    them: of offsets between which its fractions differ, noise alone would choose one.
-    """
+    """Minimum of a robust misfit near ``offset_s``, to a fraction of a step: of the parabola through three offsets,
+    whole steps of the truth apart. Interpolation averages the noise of two poses, most of all midway between them: of
+    offsets between which its fractions differ, noise alone would choose one."""
     T = log.T_world_cam
     mine, gap_s = _amounts(T, np.ones(len(T), dtype=bool), window), _gap_s(truth)
     own_s = 1e-9 * float(np.median(np.diff(truth.t_ns)))

@@ -259,12 +259,14 @@ def _of_direction(error: Array, true: Array, noise: Array, count: int) -> list[t
     """By the ``error`` (M, 3), with its ``noise`` (M, 3), of motions that are truly ``true`` (M, 3), across these."""
     length = np.linalg.norm(true, axis=1)
     moving, path = _moving(length, count), np.maximum(moving_sums(length, count), _NOWHERE_M)[:, None]
-    across = _across(moving_sums(true, count))
+    summed = moving_sums(true, count)
+    unit = summed / np.maximum(np.linalg.norm(summed, axis=1, keepdims=True), _NOWHERE_M)
+    across = np.eye(3) - unit[:, :, None] * unit[:, None]  # (W, 3, 3) projection onto what lies across each window
     turn = np.einsum("wij,wj->wi", across, moving_sums(error, count)) / path
     usual = np.median(turn[moving], axis=0)
     # Noise along one axis, as depth's, lies partly along another of what is across.
-    summed = np.sqrt(np.einsum("wij,wj->wi", across**2, _noise_of_sums(noise, count) ** 2))
-    allowed = np.maximum(_spread(turn[moving] - usual), summed / path)
+    noise_m = np.sqrt(np.einsum("wij,wj->wi", across**2, _noise_of_sums(noise, count) ** 2))
+    allowed = np.maximum(_spread(turn[moving] - usual), noise_m / path)
     # What a single motion makes of a window is a slip: it says nothing of the others.
     single = np.lib.stride_tricks.sliding_window_view(np.abs(error), count, axis=0).max(axis=-1) / path
     off = moving & (np.abs(turn - usual) - single > np.maximum(_SIGMAS * allowed, _LEAST_TURN)).any(axis=1)
@@ -275,12 +277,6 @@ def _of_direction(error: Array, true: Array, noise: Array, count: int) -> list[t
         axis = ("sideways", "vertically", "in depth")[int(np.argmax(np.abs(here)))]
         found.append((first, last, f"truth leaves odometry's direction by {degrees:.1f} deg, {axis}"))
     return found
-
-
-def _across(motions: Array) -> Array:
-    """(W, 3, 3) projection onto what lies across each motion (W, 3)."""
-    unit = motions / np.maximum(np.linalg.norm(motions, axis=1, keepdims=True), _NOWHERE_M)
-    return np.asarray(np.eye(3) - unit[:, :, None] * unit[:, None])
 
 
 def _moving(length: Array, count: int) -> NDArray[np.bool_]:

@@ -277,10 +277,8 @@ def made_from_odometry(errors: MotionErrors, log: VoLog) -> bool:
 
 
 def _high_passed(errors: MotionErrors, log: VoLog) -> tuple[Array, Array, NDArray[np.int64]]:
-    """Second differences (n, 6) of the truth's motions and of what odometry lacks of them, and their first rows (n,).
-
-    Of runs of motions, each from the frame before, of one length in time.
-    """
+    """Second differences (n, 6) of the truth's motions and of what odometry lacks of them, and their first rows (n,),
+    over motions from the frame before of one length in time."""
     steps = _ORDER - 1
     if len(errors.index) <= steps:
         return np.zeros((0, 6)), np.zeros((0, 6)), np.zeros(0, dtype=np.int64)

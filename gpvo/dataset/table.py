@@ -77,7 +77,6 @@ def _elements(kind: str, method: str, d: int) -> list[str]:
 
 @contextmanager
 def _guarded(path: Path) -> Iterator[None]:
-    """What is wrong with a file, in one line."""
     try:
         yield
     # pyarrow raises NotImplementedError for types that NumPy lacks.

@@ -162,10 +162,8 @@ def _energy(error: Array, covariance: Array, axes: NDArray[np.intp]) -> float | 
 
 
 def _final_errors(statement: Statement, log: VoLog, known: NDArray[np.bool_]) -> tuple[float | None, float | None]:
-    """Stated standard deviation of the last position with truth [m], as seen from the first pose with truth.
-
-    With the parts, and taking motions as independent.
-    """
+    """Stated standard deviation [m] of the last position with truth, from the first on: by the parts, and as if motions
+    were independent."""
     if statement.errors is None:
         return None, None
     covered = np.flatnonzero(known)

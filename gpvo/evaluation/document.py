@@ -172,7 +172,6 @@ def write_tables(e: Evaluation, folder: Path, name: str) -> list[Path]:
 
 
 def _scores(methods: Mapping[str, Any]) -> dict[str, list[Any]]:
-    """Columns of the methods that were scored."""
     rows = []
     for method, m in methods.items():
         if m["nll_per_dim"] is None:

@@ -145,7 +145,8 @@ def evaluate_run(
     _refuse_too_little(run, truth, int(known.sum()))
     blind = turn_without_truth_deg(log, truth) > 0.0
     leaps = [] if blind else jumps(log, truth)
-    scored = _unscored(log) if blind else without_wandering_truth(log, truth, leaps)
+    unseen = (r.with_status(Status.LOST, "truth has no attitude") for r in log)  # positions alone judge no motion
+    scored = log.judged_as(unseen) if blind else without_wandering_truth(log, truth, leaps)
     errors = motion_errors(scored, truth)
     stated = np.repeat(options.truth_sigma or (truth.sigma_translation_m, truth.sigma_rotation_rad), 3)
     sigma = stated
@@ -190,11 +191,6 @@ def evaluate_run(
         in_domain=_in_domain(predictions),
         misfits=misfits,
     )
-
-
-def _unscored(log: VoLog) -> VoLog:
-    """The log with every motion called lost: a truth of positions alone judges none."""
-    return log.judged_as(r.with_status(Status.LOST, "truth has no attitude") for r in log)
 
 
 def _refuse_too_little(run: Run, truth: TruthLog, known: int) -> None:

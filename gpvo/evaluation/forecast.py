@@ -173,11 +173,10 @@ def _fly(
     predictor: Predictor, plan: Plan, sample: TrainingSample, rng: np.random.Generator
 ) -> tuple[NDArray[np.int64], Prediction]:
     """One draw: the pose that each motion starts from (N,), -1 for the first pose, and what the model says of the
-    motions that end at poses 1 to N - 1, in the conditions of training rows that moved alike.
+    motions that end at poses 1 to N - 1, in the conditions, and with the references, of training rows that moved alike.
 
-    A row is taken as it is, with the velocities as odometry measured them, noise and all: the model knows no others.
-    Only where the plan leaves the range of the training does the plan's own value stand in its place. Where odometry
-    kept its reference over several frames, so it does here.
+    A row is taken with the velocities as odometry measured them, noise and all: the model knows no others. The plan's
+    own stand in their place only where it leaves the range of the training.
     """
     names = [n for n in PLANNED if n in predictor.features]
     at, domain = positions(predictor.features, names), predictor.model.domain
@@ -205,10 +204,8 @@ def _references(like: NDArray[np.int64], frames: NDArray[np.int64]) -> tuple[NDA
 
 
 def _like(twist: Array, sample: TrainingSample, at: list[int], scale: Array, rng: np.random.Generator) -> NDArray:
-    """For each motion (n, 6) one of the rows that moved most alike, as indices (n,).
-
-    Of these the row whose sequence comes first in an order drawn once: conditions last as long as the motion allows.
-    """
+    """Index (n,) of a row for each motion (n, 6): of those that moved most alike, the one whose sequence comes first in
+    an order drawn once, so that conditions last as long as the motion allows."""
     A, B = twist / scale[at], sample.X[:, at] / scale[at]
     order = rng.permutation(int(sample.sequence.max()) + 1)[sample.sequence] + rng.random(len(B))
     few = min(_NEIGHBOURS, len(B))

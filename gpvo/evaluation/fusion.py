@@ -141,7 +141,6 @@ def _findings(run: Run, flight: Flight, options: FuseOptions) -> list[str]:
 
 
 def _why_not(policy: str, constants: Constants | None, predictor: Predictor | None) -> str:
-    """Why a policy could not run at all, and the cure."""
     if policy == LEARNED and predictor is not None:
         return "no frame has a prediction: the model predicts only motions that odometry found"
     if policy == LEARNED:

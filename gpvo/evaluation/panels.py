@@ -200,10 +200,8 @@ def inputs(e: Evaluation) -> list[Panel]:
 
 
 def _shades(e: Evaluation) -> list[dict[str, Any]]:
-    """Stretches of time that were degraded or lost; each frame reaches back to the one before.
-
-    Those that no screen shows apart are one: each panel of a long run would hold thousands.
-    """
+    """Stretches of time that were degraded or lost, each frame from the one before on; one where no screen shows them
+    apart: each panel of a long run would hold thousands."""
     t_s, out = [round(float(t), 3) for t in e.t_s], []
     last: dict[str, dict[str, Any]] = {}
     statuses = e.run.log.statuses

@@ -13,7 +13,6 @@ from typing import Any
 
 import cv2
 import numpy as np
-from numpy.typing import NDArray
 
 from gpvo.accumulation import PoseError
 from gpvo.errors import GpvoError
@@ -134,7 +133,9 @@ def _picture(k: int, step: Step, source: Source) -> MatchPicture:
     grey = np.full((source.camera.height, source.camera.width), 40, np.uint8) if image is None else image
     canvas = cv2.cvtColor(np.ascontiguousarray(grey), cv2.COLOR_GRAY2BGR)
     for before, now, good in zip(matches.uvd_prev, matches.uvd_cur, inliers, strict=True):
-        _arrow(canvas, before[:2], now[:2], _GOOD_BGR if good else _BAD_BGR)
+        a, b = (tuple(int(v) for v in np.round(16 * p[:2])) for p in (before, now))
+        cv2.line(canvas, a, b, _GOOD_BGR if good else _BAD_BGR, 1, cv2.LINE_AA, shift=4)
+        cv2.circle(canvas, b, 32, _GOOD_BGR if good else _BAD_BGR, 1, cv2.LINE_AA, shift=4)
     done, packed = cv2.imencode(".jpg", canvas, [cv2.IMWRITE_JPEG_QUALITY, 80])
     assert done
     reason = f" ({record.reason})" if record.reason else ""
@@ -143,9 +144,3 @@ def _picture(k: int, step: Step, source: Source) -> MatchPicture:
         f" {record.reproj_rms_px:.2f} px rms"
     )
     return MatchPicture(k, caption, "data:image/jpeg;base64," + base64.b64encode(packed.tobytes()).decode("ascii"))
-
-
-def _arrow(canvas: NDArray[np.uint8], before: NDArray[np.float64], now: NDArray[np.float64], colour: tuple) -> None:
-    a, b = (tuple(int(v) for v in np.round(16 * p)) for p in (before, now))
-    cv2.line(canvas, a, b, colour, 1, cv2.LINE_AA, shift=4)
-    cv2.circle(canvas, b, 32, colour, 1, cv2.LINE_AA, shift=4)

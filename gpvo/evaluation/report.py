@@ -58,7 +58,6 @@ def render(evaluations: Sequence[Evaluation], pictures: Sequence[MatchPicture] =
 
 
 def _groups(e: Evaluation) -> list[dict[str, Any]]:
-    """What is drawn, where there is something: titled groups of panels."""
     out = []
     for (title, note), drawings in panels.GROUPS.items():
         drawn = [_embedded(panel) for d in drawings for panel in d.of(e)]

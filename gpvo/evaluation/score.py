@@ -199,7 +199,6 @@ def on_other_axes(found: Mapping[str, Mapping[str, Any]]) -> dict[str, tuple[str
 
 
 def _mean_with(mean: float, count: int, charged: Array) -> float:
-    """Mean over the stated motions and the charged ones."""
     return float((mean * count + charged.sum()) / (count + len(charged)))
 
 

@@ -218,7 +218,6 @@ def _listed(names: Sequence[str]) -> str:
 
 
 def _conditions(e: Evaluation) -> Iterator[str]:
-    """What was seen of the run, of its truth, and of the model's domain."""
     if e.in_domain is not None:
         yield f"{100 * e.in_domain:.0f} % of the frames lie in the model's training domain."
     for problem in e.misfits:
@@ -300,7 +299,6 @@ def _are_strangers(e: Evaluation) -> bool:
 
 
 def _of_unlike(found: Resemblance) -> str:
-    """What to look for where odometry and truth do not move alike."""
     shares = {"motion": found.motion, "turn": found.turn}
     apart = " and ".join(f"{100 * share:.0f} % of the {what}" for what, share in shares.items() if share > 0.05)
     told = f"over a second they differ by {apart}, however their frames are turned against each other"

@@ -94,12 +94,6 @@ def so3_log(R: Array) -> Array:
     return xyz * scale[..., None]
 
 
-def so3_left_jacobian(phi: Array) -> Array:
-    """Left Jacobian of SO(3), ``V`` in the SE(3) exponential. (..., 3) -> (..., 3, 3)."""
-    _, b, c, W, WW = _powers(phi)
-    return np.eye(3) + b * W + c * WW
-
-
 def right_jacobian_inverse(xi: Array) -> Array:
     """d log(T exp(e)) / d e at e = 0, for xi = log(T). (..., 6) -> (..., 6, 6).
 
@@ -114,7 +108,7 @@ def right_jacobian_inverse(xi: Array) -> Array:
 
 
 def so3_left_jacobian_inverse(phi: Array) -> Array:
-    """Inverse of :func:`so3_left_jacobian`. (..., 3) -> (..., 3, 3)."""
+    """Inverse of the left Jacobian of SO(3), which is ``V`` in the SE(3) exponential. (..., 3) -> (..., 3, 3)."""
     phi = np.asarray(phi, dtype=np.float64)
     theta2 = (phi**2).sum(-1)
     a, b, _ = _coefficients(theta2)

@@ -287,10 +287,8 @@ def read_imu(
 
 
 def _samples(path: Path, topic: str) -> tuple[Stamps, Array]:
-    """Stamps (N,) and samples (N, 6), gyro first; NaN where the topic does not measure.
-
-    That is where a covariance begins with -1, as ROS has it, or nothing but exact zeros came.
-    """
+    """Stamps (N,) and samples (N, 6), gyro first; NaN where the topic does not measure: its covariance begins with -1,
+    as ROS has it, or nothing but exact zeros came."""
     stamps, rows = array("q"), array("d")  # of hours: lists of numbers take several times as much
     with open_bag(path) as reader:
         for _, m in messages(reader, [topic]):

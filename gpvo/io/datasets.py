@@ -124,8 +124,8 @@ def _read_image_list(path: Path, known: SourceReport) -> list[tuple[int, str]]:
         stamp, _, name = (part.strip() for part in text.partition(","))
         name = name or f"{stamp}.png"
         try:
-            if not _is_plain_name(name):
-                raise ValueError
+            if not 0 < len(name.encode()) <= 255 or name in (".", "..") or set(name) & set("/\\\0"):
+                raise ValueError  # it would lead out of its folder
             out.append((integer_ns(stamp), name))
         except ValueError:
             known.count("unreadable", f"{path.parent.name}/{path.name} line {number} is not 'stamp_ns,file'")
@@ -135,11 +135,6 @@ def _read_image_list(path: Path, known: SourceReport) -> list[tuple[int, str]]:
     if in_time != out:
         known.note(f"{path.parent.name}/{path.name} is not in time order: sorted by stamp")
     return in_time
-
-
-def _is_plain_name(name: str) -> bool:
-    """Whether a name stays inside its folder."""
-    return 0 < len(name.encode()) <= 255 and name not in (".", "..") and not any(c in name for c in ("/", "\\", "\0"))
 
 
 def _imu_noise(path: Path, mav: Path) -> ImuNoise | None:

@@ -105,7 +105,6 @@ def _find_images(path: Path) -> tuple[dict[str, Path], dict[str, Path]]:
 
 
 def _stamps(path: Path, keys: list[str], rate_hz: float | None, known: SourceReport) -> dict[str, int]:
-    """Stamp [ns] of each key."""
     numbers = _numbers(keys)
     if len(numbers) == len(keys) and all("." in n or len(n) >= _STAMP_DIGITS for n in numbers.values()):
         try:

@@ -134,10 +134,8 @@ def read_table(path: Path, mapping: Mapping[str, str]) -> Table:
 
 
 def _lines(path: Path) -> Iterator[tuple[int, list[str]]]:
-    """Line numbers and fields, the header first: the first line of names, or the last comment before the numbers.
-
-    The header that the layout of VINS-Fusion stands for has the number 0.
-    """
+    """Line numbers and fields, the header first: the first line of names, or the last comment before the numbers; 0 is
+    the number of that which the layout of VINS-Fusion stands for."""
     try:
         comment: tuple[int, str] | None = None
         separator: str | None = None
@@ -158,10 +156,8 @@ def _lines(path: Path) -> Iterator[tuple[int, list[str]]]:
 
 
 def _implied_header(path: Path, text: str, separator: str) -> list[str]:
-    """The names that VINS-Fusion's result files leave out.
-
-    Raises SourceError, with the line to put on top, where the first line of numbers is of another file.
-    """
+    """The names that VINS-Fusion's result files leave out. Raises SourceError, with the line to put on top, for another
+    file's first line."""
     fields = _split(text, separator)
     if fields[-1] == "":  # VINS ends its lines with a comma.
         fields.pop()

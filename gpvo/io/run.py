@@ -182,7 +182,12 @@ class RunWriter:
         replaces = self.path != self._target
         try:
             if complete or not replaces:
-                self._finish(complete)
+                self.flush()
+                for kind, parts in self._state.written.items() if complete else ():
+                    join_tables(parts, self.path / table_of(kind), {"schema": str(SCHEMA)})
+                if complete:
+                    shutil.rmtree(self._chunks, ignore_errors=True)
+                self._write_meta(complete=complete)
             if complete and replaces:
                 run_folder.put_in_place(self.path, self._target)
         finally:
@@ -193,14 +198,6 @@ class RunWriter:
             # Where the new run is not whole, the finished one that it was to replace is worth more.
             shutil.rmtree(self.path, ignore_errors=True)
         self._lock.release()
-
-    def _finish(self, complete: bool) -> None:
-        self.flush()
-        if complete:
-            for kind, parts in self._state.written.items():
-                join_tables(parts, self.path / table_of(kind), {"schema": str(SCHEMA)})
-            shutil.rmtree(self._chunks, ignore_errors=True)
-        self._write_meta(complete=complete)
 
     def _write_meta(self, *, complete: bool) -> None:
         state = self._state

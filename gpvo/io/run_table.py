@@ -136,7 +136,6 @@ def records_from(columns: Mapping[str, NDArray[Any]]) -> StoredRecords:
 
 
 def _objects(values: Iterable[Any], n: int) -> NDArray[Any]:
-    """(n,) Python objects as they are."""
     return np.fromiter(values, dtype=object, count=n)
 
 
@@ -235,7 +234,6 @@ def _stacked(columns: Mapping[str, NDArray[Any]], names: Iterable[str]) -> Array
 
 
 def _union(maps: Iterable[Mapping[str, Any]]) -> list[str]:
-    """All keys, in first-seen order."""
     return list(dict.fromkeys(key for m in maps for key in m))
 
 

@@ -10,14 +10,13 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
 from functools import cache
-from importlib.metadata import EntryPoint, entry_points
 from pathlib import Path
 from typing import Any, Literal, Protocol, runtime_checkable
 
 import numpy as np
 from numpy.typing import NDArray
 
-from gpvo.errors import SourceError, printable
+from gpvo.errors import SourceError, plugins, printable
 from gpvo.types import ImuLog, Mounting, StereoCamera, StereoFrame, TrackFrame, TruthLog
 
 
@@ -133,12 +132,7 @@ def source_kinds() -> dict[str, Callable[[], Any]]:
     A package joins with ``[project.entry-points."gpvo.sources"]`` and ``name = "package.module:Class"``; the class
     follows :class:`Source` and is built from a path. A built-in name cannot be taken over.
     """
-    kinds: dict[str, Callable[[], Any]] = {
-        name: EntryPoint(name, target, "gpvo.sources").load for name, target in BUILT_IN.items()
-    }
-    for entry in entry_points(group="gpvo.sources"):
-        kinds.setdefault(entry.name, entry.load)
-    return kinds
+    return plugins("gpvo.sources", BUILT_IN)
 
 
 def guess(path: str | Path) -> str:

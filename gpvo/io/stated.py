@@ -185,9 +185,7 @@ def _motion_covariances(log: ForeignLog, motions: Array) -> tuple[str, Array | N
 
 def _if_of_poses(C: Array, motions: Array) -> list[str]:
     """A remark where covariances (N, 6, 6) that are said to be of motions (N, 4, 4) look like those of poses: they
-    change slowly, and state many times the noise that shows in the motions.
-
-    The second difference of a velocity has six times its white noise, and the vehicle's own jerk besides.
+    change slowly, and state many times the noise in the motions, whose second differences have six times its variance.
     """
     stated = np.trace(C[:, :3, :3], axis1=1, axis2=2)
     known = np.isfinite(stated) & (stated > 0)

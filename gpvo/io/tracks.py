@@ -102,7 +102,6 @@ class TracksSource:
         return t_ns
 
     def _observations(self) -> None:
-        """Sort the rows by frame and check them."""
         path, n = self.path, len(self._t_ns)
         frame = self._array("frame", None, most=2.0**53).astype(np.int64)
         m = len(frame)

@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from gpvo.dataset.build import group_folds
-from gpvo.learning.basefit import learn_domain, learn_velocities
+from gpvo.learning.basefit import learn_domain, rate_changes, usual_rate_var
 from gpvo.learning.calibrate import LEVELS, Scale, conformal_quantiles, fit_joint_factor, fit_outside_power, fit_scale
 from gpvo.learning.logvariance import log_ratio
 from gpvo.learning.parts import MOST_ROWS, Parts, fit_parts, part_correlations
@@ -19,7 +19,7 @@ from gpvo.learning.patterns import PERSISTENT_S, Patterns, learn_patterns
 from gpvo.learning.poses import Poses, Windows, added_factor, pose_losses, windows_of, with_added
 from gpvo.learning.rows import Rows, significant_gain, simplest_sufficient
 from gpvo.learning.spans import at_most
-from gpvo.online.base import TWIST_COLUMNS, BaseVariance, feature_noise, motion_noise
+from gpvo.online.base import TWIST_COLUMNS, BaseVariance, Velocities, feature_noise, motion_noise
 from gpvo.online.division import Division, ln_faster, of_calibration
 from gpvo.online.estimate import ErrorModel
 from gpvo.online.projected import ProjectedGP
@@ -79,7 +79,7 @@ def assemble(rows: Rows, columns: tuple[str, ...], learned: VarianceModel) -> tu
         domain=domain,
         base=base,
         division=divided[0].whole,
-        velocities=learn_velocities(rows),
+        velocities=Velocities(usual_rate_var(rows), rate_changes(rows)),
         factor=scale.factor,
         outside_power=np.array([outside_power]),
         high=high,
@@ -169,7 +169,6 @@ def _most_likely(model: ErrorModel, of: _Residuals, divided: Sequence[_Divided])
 
 
 def _consistent(model: ErrorModel, of: _Residuals, divided: _Divided) -> _Consistent:
-    """The model, calibrated for poses and for all six axes jointly."""
     whole, joint, poses = _jointly(of, divided)
     added = added_factor(poses, divided.whole.share)
     if added != 1.0:

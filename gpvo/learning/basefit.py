@@ -6,7 +6,7 @@ import numpy as np
 
 from gpvo.dataset.build import TrainingSet
 from gpvo.learning.rows import Rows
-from gpvo.online.base import COASTED, TWIST_COLUMNS, Velocities
+from gpvo.online.base import COASTED, TWIST_COLUMNS
 from gpvo.online.guard import Domain
 from gpvo.stats.student_t import NU, log_fisher, log_scale_score, negative_log_likelihood
 from gpvo.types import Array
@@ -50,10 +50,8 @@ def fit_coefficients(terms: Array, error: Array, weight: Array) -> Array:
 
 
 def _scoring_step(X: Array, square: Array, count: Array, theta: Array) -> Array:
-    """(6, 5) Fisher's step from ``theta`` within the bounds: a factor at a bound that would cross it is held there.
-
-    Zero for an axis that it would not make likelier by a hundredth of what ends the search.
-    """
+    """(6, 5) Fisher's step from ``theta``: a factor at a bound that would cross it is held there; zero for an axis that
+    it would not make likelier by a hundredth of what ends the search."""
     v = (X @ theta[..., None])[..., 0]
     R = X / v[..., None]
     score = ((count * log_scale_score(square * (NU / (NU - 2.0)) / v, NU))[:, None] @ R)[:, 0]
@@ -65,11 +63,6 @@ def _scoring_step(X: Array, square: Array, count: Array, theta: Array) -> Array:
     step = np.asarray(np.linalg.solve(information, score[..., None])[..., 0])
     gain = 0.5 * (step * score).sum(axis=1, keepdims=True)
     return np.where(gain > 0.01 * _ENOUGH, step, 0.0)
-
-
-def learn_velocities(rows: Rows) -> Velocities:
-    """Of all sequences alike."""
-    return Velocities(usual_rate_var(rows), rate_changes(rows))
 
 
 def usual_rate_var(rows: Rows) -> Array:
@@ -98,10 +91,10 @@ def _changes(s: TrainingSet, m: int, step_s: float) -> Array:
     return np.asarray(change[np.isfinite(change).all(axis=1)])
 
 
-def learn_domain(X: Array, *, margin: float = 0.02) -> Domain:
+def learn_domain(X: Array) -> Domain:
     """Where training rows (n, d) lie, not finite where a value is missing.
 
-    The narrower range leaves out one row in five thousand at either end; both are extended by ``margin`` of its width.
+    The narrower range leaves out one row in five thousand at either end; both are extended by a fiftieth of its width.
     """
     X = np.where(np.isfinite(X), X, np.nan)
     centre = np.nanmedian(X, axis=0)
@@ -114,7 +107,7 @@ def learn_domain(X: Array, *, margin: float = 0.02) -> Domain:
     scale = np.where(scale > 1e-12 * np.maximum(np.abs(centre), 1.0), scale, of_constant)
     U = (X - centre) / scale
     low, high = np.nanquantile(U, [_RARE, 1.0 - _RARE], axis=0)
-    pad = margin * (high - low)
+    pad = 0.02 * (high - low)
     least, most = np.nanmin(U, axis=0), np.nanmax(U, axis=0)
     U = np.clip(np.nan_to_num(U), low - pad, high + pad)
     C = np.cov(U, rowvar=False).reshape(X.shape[1], -1)

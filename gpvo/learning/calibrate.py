@@ -80,12 +80,10 @@ def fit_outside_power(distance: Array, square: Array, group: NDArray) -> float:
 def fit_joint_factor(error: Array, covariance: Array, group: NDArray) -> float:
     """One more factor, which makes the joint NEES of all six axes right for a new group."""
     squared = nees(error, covariance) / error.shape[1]
-    return float(Scale.of_new_group(np.array([[robust_mean(squared[group == g])] for g in np.unique(group)])).factor[0])
-
-
-def robust_mean(values: Array) -> float:
-    """Mean, with the upper half per cent replaced by the quantile there."""
-    return float(np.minimum(values, np.quantile(values, 0.995)).mean())
+    by_group = (squared[group == g] for g in np.unique(group))
+    # Robust: the upper half per cent is replaced by the quantile there.
+    means = np.array([[np.minimum(of, np.quantile(of, 0.995)).mean()] for of in by_group])
+    return float(Scale.of_new_group(means).factor[0])
 
 
 def conformal_quantiles(score: Array, group: NDArray) -> tuple[list[float], list[bool]]:

@@ -130,11 +130,8 @@ def _fit(
     rows: Rows, terms: Array, U: Array, of: NDArray[np.bool_], theta: Array
 ) -> tuple[Array, ProjectedGP | None, Array]:
     """Coefficients of the base, GP, and what it leaves of the errors, for the rows ``of``. The base, ``theta`` if
-    alone, is the GP's mean function, and is fitted once more with it.
-
-    Explicit basis functions: C. E. Rasmussen, C. K. I. Williams, "Gaussian Processes for Machine Learning" (2006),
-    section 2.7; here of the variance, so in turn.
-    """
+    alone, is the GP's mean function, fitted once more with it, in turn (C. E. Rasmussen, C. K. I. Williams, "Gaussian
+    Processes for Machine Learning", 2006, section 2.7, explicit basis functions)."""
     terms, error, weight = terms[of], rows.error[of], rows.weight[of]
     if U.shape[1] == 0:
         return theta, None, error

@@ -78,10 +78,8 @@ def _whitening(points: Array) -> Array:
 
 
 def _mode(prior: ProjectedGP, Z: Array, ratio: Array, weight: Array, group: NDArray[np.int64]) -> ProjectedGP:
-    """The posterior's mode, and the variance about it, by the directions Z (n, r) of unit prior variance.
-
-    The working response ``g + score / fisher`` of noise variance ``1 / fisher`` has the mode as its fixed point.
-    """
+    """The posterior's mode, and the variance about it, by the directions Z (n, r) of unit prior variance: the fixed
+    point of the working response ``g + score / fisher`` of noise variance ``1 / fisher``."""
     fisher = float(log_fisher(NU))
     labels, place = np.unique(group, return_inverse=True)
     total = np.bincount(place, weight, len(labels))

@@ -37,12 +37,6 @@ METHODS = (
 )
 
 
-def constant_covariance(sets: Sequence[TrainingSet]) -> Array:
-    """(6, 6) mean square of the training errors."""
-    Y = np.concatenate([s.Y for s in sets])
-    return Y.T @ Y / len(Y) + 1e-15 * np.eye(6)
-
-
 def best_scale(sets: Sequence[TrainingSet], method: str) -> Array | None:
     """(6,) factor per axis on the variance with the best joint likelihood on all rows.
 
@@ -70,8 +64,10 @@ def best_scale(sets: Sequence[TrainingSet], method: str) -> Array | None:
 
 
 def method_arrays(sets: Sequence[TrainingSet]) -> dict[str, NDArray[Any]]:
-    """What a model file keeps of the simple methods: ``method.constant`` (6, 6), ``method.<stated>.scale`` (6,)."""
-    out: dict[str, NDArray[Any]] = {"method.constant": constant_covariance(sets)}
+    """What a model file keeps of the simple methods: ``method.constant`` (6, 6), the mean square of the training
+    errors, and ``method.<stated>.scale`` (6,)."""
+    Y = np.concatenate([s.Y for s in sets])
+    out: dict[str, NDArray[Any]] = {"method.constant": Y.T @ Y / len(Y) + 1e-15 * np.eye(6)}
     for method in STATED:
         scale = best_scale(sets, method)
         if scale is not None:

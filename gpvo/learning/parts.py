@@ -234,11 +234,9 @@ def _fit_shape(windows: _Windows, shape: Shape, widen: Array | None = None) -> _
 
 
 def _terms(w: _Windows, gains: tuple[Array, Array] | None, tau: float, share: Array) -> Array:
-    """(3, d, W) variance of the sum over each window of jitter, white and bias of unit share at the typical level.
-
-    The motions' variances are divided as :func:`gpvo.online.division.divide` does with ``share``, where white and bias
-    have ``gains`` (d, R) over the jitter.
-    """
+    """(3, d, W) variance of the sum over each window of jitter, white and bias of unit share at the typical level,
+    divided as :func:`gpvo.online.division.divide` does with ``share``; white and bias have ``gains`` (d, R) over the
+    jitter."""
     each = white = bias = w.variance
     if gains is not None:
         each = w.variance / (share[0, :, None] + share[1, :, None] * gains[0] + share[2, :, None] * gains[1])

@@ -13,6 +13,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 
@@ -53,18 +54,23 @@ class Verdict:
     parameter: str
     value: float | None  # None where what hides the covariance is no number
     hidden_percent: float
-    predicted: tuple[float, float, float]  # 5th, 50th and 95th percentile of the predicted sigma
+    predicted_sigma: tuple[float, float, float]  # its 5th, 50th and 95th percentile
     unit: str
     advice: str = ""
 
     def __str__(self) -> str:
-        low, middle, high = self.predicted
+        low, middle, high = self.predicted_sigma
         value = "" if self.value is None else f" = {self.value:g}"
         line = (
             f"{self.quantity}: predicted sigma {low:.3g} / {middle:.3g} / {high:.3g} {self.unit} (5, 50, 95 %); "
             f"{self.parameter}{value} hides it in {self.hidden_percent:.0f} % of frames"
         )
         return line + (f". {self.advice}" if self.advice else "")
+
+    def document(self) -> dict[str, Any]:
+        """Machine-readable form."""
+        sigma = dict(zip(("p5", "p50", "p95"), self.predicted_sigma, strict=True))
+        return {**vars(self), "predicted_sigma": sigma, "advice": self.advice or None}
 
 
 def check(odometry: Sequence[Odometry], consumer: str) -> list[Verdict]:
@@ -100,11 +106,8 @@ def _check_px4(pose: Array, twist: Array) -> list[Verdict]:
 
 
 def _check_fusioncore(pose: Array, twist: Array) -> list[Verdict]:
-    """What is lost are correlations, which make some combinations of axes more certain, and a pose's small sigmas.
-
-    ``hidden_percent``: frames whose most certain combination of axes, in units of the sigmas used, is taken for more
-    than twice as uncertain as it is.
-    """
+    """What is lost are correlations and a pose's small sigmas: ``hidden_percent`` of the frames have a combination of
+    axes that is taken for more than twice as uncertain as it is."""
     out, read = [], [0, 1, 5]
     planar = twist[:, read][:, :, read]
     used = np.array([fusioncore_sigmas(C) for C in pose])

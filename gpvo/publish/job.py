@@ -43,19 +43,8 @@ class Published:
 
     def document(self) -> dict[str, Any]:
         """Machine-readable form."""
-        verdicts = [
-            {
-                "quantity": v.quantity,
-                "parameter": v.parameter,
-                "value": v.value,
-                "hidden_percent": v.hidden_percent,
-                "predicted_sigma": {"p5": v.predicted[0], "p50": v.predicted[1], "p95": v.predicted[2]},
-                "unit": v.unit,
-                "advice": v.advice or None,
-            }
-            for v in self.verdicts
-        ]
-        return {"schema": 1, **{k: v for k, v in vars(self).items() if k != "verdicts"}, "checks": verdicts}
+        told = {k: v for k, v in vars(self).items() if k != "verdicts"}
+        return {"schema": 1, **told, "checks": [v.document() for v in self.verdicts]}
 
     def __str__(self) -> str:
         written = f"{self.out}: {self.messages} messages" if self.out else f"{self.run}: nothing written"

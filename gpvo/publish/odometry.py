@@ -123,7 +123,6 @@ class OdometryBuilder:
         return self._message(record, prediction, chain, twist, twist_covariance)
 
     def _error(self, record: VoRecord, prediction: Prediction | None) -> MotionError:
-        """What is stated of a measured motion."""
         if prediction is not None:
             if not is_positive_definite(prediction.covariance):
                 raise GpvoError(f"the prediction at t_ns {record.t_ns} is not symmetric positive definite")

@@ -265,7 +265,6 @@ def scored(cells: Sequence[Cell], store: Store) -> list[dict[str, Any]]:
 
 
 def _head(e: Experiment) -> dict[str, Any]:
-    """What a row says of itself."""
     return {
         **{name: getattr(e, name) for name in ("key", "table", "title", "method")},
         "sigma_px": list(e.sigma_px) if e.method == "pointing_matching" else None,

@@ -135,10 +135,8 @@ def _wander(scenario: Scenario, world: World, rng: np.random.Generator) -> Path3
 
 
 def _place_recording(scenario: Scenario, world: World, recording: Recording, rng: np.random.Generator) -> Path3:
-    """The recording where, of some places and directions drawn, it fits at the largest scale, at most 1.
-
-    In a world with a long line its longest extent and the nose point along the line.
-    """
+    """The recording where, of some places and directions drawn, it fits at the largest scale, at most 1; its longest
+    extent and the nose point along the line of a world that has a long one."""
     drawn = []
     for _ in range(_PLACES):
         middle, along = _draw_place(scenario, world, rng)

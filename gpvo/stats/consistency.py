@@ -130,14 +130,14 @@ def crps_gaussian(error: Array, sigma: Array) -> Array:
     return sigma * (z * (2 * cdf - 1) + 2 * pdf - 1 / math.sqrt(math.pi))
 
 
-def energy_score(error: Array, covariance: Array, *, draws: int = 256, seed: int = 0) -> Array:
+def energy_score(error: Array, covariance: Array, *, draws: int = 256) -> Array:
     """``E|X - e| - E|X - X'| / 2`` for X, X' ~ N(0, C): the CRPS of vectors, in the error's unit. (..., d) -> (...).
 
     By antithetic draws, the same for all rows.
     """
     error, covariance = _checked(error, covariance)
     d = error.shape[-1]
-    half = np.random.default_rng(seed).standard_normal((draws // 2, d))
+    half = np.random.default_rng(0).standard_normal((draws // 2, d))
     z, out = np.concatenate([half, -half]), np.empty(error.shape[:-1])
     rows, spreads, scores = error.reshape(-1, d), covariance.reshape(-1, d, d), out.reshape(-1)
     for k in range(0, len(rows), _AT_ONCE):  # draws of a million rows fill no memory
@@ -158,15 +158,15 @@ def correlation_gain(error: Array, covariance: Array) -> Array:
     return nll_per_dim(error, variances[..., None] * np.eye(variances.shape[-1])) - nll_per_dim(error, covariance)
 
 
-def by_difficulty(error: Array, covariance: Array, groups: int = 4) -> tuple[Array, Array]:
-    """NEES/dof and coverage at one sigma in groups of rising stated uncertainty, each of equal size. (groups,) each.
+def by_difficulty(error: Array, covariance: Array) -> tuple[Array, Array]:
+    """(4,) NEES/dof and (4,) coverage at one sigma in quartiles of rising stated uncertainty.
 
-    A covariance that is right on average but blind to what makes a motion hard is too wide in the first group and too
-    narrow in the last. Difficulty is the determinant of the covariance. NaN with fewer rows than groups.
+    A covariance that is right on average but blind to what makes a motion hard is too wide in the first and too narrow
+    in the last. Difficulty is the determinant of the covariance. NaN with fewer than four rows.
     """
-    if len(error) < groups:
-        return np.full(groups, np.nan), np.full(groups, np.nan)
-    rows = np.array_split(np.argsort(np.linalg.slogdet(covariance)[1], kind="stable"), groups)
+    if len(error) < 4:
+        return np.full(4, np.nan), np.full(4, np.nan)
+    rows = np.array_split(np.argsort(np.linalg.slogdet(covariance)[1], kind="stable"), 4)
     sigma = np.sqrt(np.diagonal(covariance, axis1=-2, axis2=-1))
     d = error.shape[-1]
     return (

@@ -165,18 +165,16 @@ _REACHED_BY = 7
 """Sequences whose draws reach well beyond the expanded percentiles."""
 
 
-def sequence_bootstrap(values: Array, *, draws: int = 10000, seed: int = 0) -> Interval:
+def sequence_bootstrap(values: Array, *, draws: int = 10000) -> Interval:
     """Interval for the mean over sequences (n,): whole sequences are drawn with replacement.
 
     For a paired comparison pass the differences. Fewer than three sequences show no spread: (-inf, inf).
     """
     values = np.asarray(values, dtype=np.float64)
-    return bootstrap_over(len(values), lambda pick: values[pick].mean(axis=1), draws=draws, seed=seed)
+    return bootstrap_over(len(values), lambda pick: values[pick].mean(axis=1), draws=draws)
 
 
-def bootstrap_over(
-    n: int, statistic: Callable[[NDArray[np.int64]], Array], *, draws: int = 10000, seed: int = 0
-) -> Interval:
+def bootstrap_over(n: int, statistic: Callable[[NDArray[np.int64]], Array], *, draws: int = 10000) -> Interval:
     """The same for any ``statistic`` (draws,) of n sequences, given the indices (draws, n) of those that were drawn.
 
     The percentiles that up to six sequences call for lie beyond the most extreme draw or near it, which they reach too
@@ -185,7 +183,7 @@ def bootstrap_over(
     value = float(statistic(np.arange(n)[None])[0]) if n else np.nan
     if n < 3:
         return Interval(value, -np.inf, np.inf)
-    drawn = statistic(np.random.default_rng(seed).integers(0, n, (draws, n)))
+    drawn = statistic(np.random.default_rng(0).integers(0, n, (draws, n)))
     if n >= _REACHED_BY:
         return _expanded(value, drawn, n)
     half = student_t.quantile(_LEVEL, n - 1) * math.sqrt(n / (n - 1)) * float(drawn.std())

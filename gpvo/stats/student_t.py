@@ -30,10 +30,10 @@ NU_GAUSSIAN = 60.0
 _GOLDEN = 0.5 * (math.sqrt(5.0) - 1.0)
 
 
-def negative_log_likelihood(square: Array, variance: Array, nu: float = NU) -> Array:
-    """Of a t with second moment ``variance`` at the squared error, without the constant of ``nu`` [nats]."""
-    scale = variance * (nu - 2.0) / nu
-    return 0.5 * np.log(scale) + 0.5 * (nu + 1.0) * np.log1p(square / (nu * scale))
+def negative_log_likelihood(square: Array, variance: Array) -> Array:
+    """Of a t with second moment ``variance`` at the squared error, without the constant of :data:`NU` [nats]."""
+    scale = variance * (NU - 2.0) / NU
+    return 0.5 * np.log(scale) + 0.5 * (NU + 1.0) * np.log1p(square / (NU * scale))
 
 
 def log_fisher(nu: ArrayLike) -> Array:
@@ -114,12 +114,12 @@ def second_moment(square: Array) -> Array:
     return np.exp(log_scale - np.log1p(-2.0 / nu))  # from squared scale to variance: nu / (nu - 2)
 
 
-def scatter(z: Array, nu: float = NU) -> Array:
+def scatter(z: Array) -> Array:
     """Scatter matrix (D, D) of residuals (n, D) by a multivariate t: iterated weights (Lange et al., section 3)."""
     d = z.shape[1]
     C = np.eye(d)
     for _ in range(20):
-        w = (nu + d) / (nu + ((z @ np.linalg.inv(C)) * z).sum(axis=1))
+        w = (NU + d) / (NU + ((z @ np.linalg.inv(C)) * z).sum(axis=1))
         C_new = (z * w[:, None]).T @ z / len(z) + 1e-9 * np.eye(d)
         done = np.abs(C_new - C).max() < 1e-6
         C = C_new
@@ -128,11 +128,11 @@ def scatter(z: Array, nu: float = NU) -> Array:
     return C
 
 
-def _minimum(loss: Callable[[Array], Array], low: Array, high: Array, tolerance: float = 1e-3) -> Array:
-    """Of functions of one variable each, by golden sections."""
+def _minimum(loss: Callable[[Array], Array], low: Array, high: Array) -> Array:
+    """Of functions of one variable each, to a thousandth, by golden sections."""
     a, b = high - _GOLDEN * (high - low), low + _GOLDEN * (high - low)
     at_a, at_b = loss(a), loss(b)
-    while (high - low).max() > tolerance:
+    while (high - low).max() > 1e-3:
         left = at_a < at_b
         low, high = np.where(left, low, a), np.where(left, b, high)
         kept, at_kept = np.where(left, a, b), np.where(left, at_a, at_b)

@@ -238,13 +238,13 @@ class NormalEquations:
 
 
 def _conjugate_gradients(
-    apply: Callable[[Array], Array], right: Array, precondition: Callable[[Array], Array], tolerance: float = 1e-2
+    apply: Callable[[Array], Array], right: Array, precondition: Callable[[Array], Array]
 ) -> Array:
-    """Solution (F, 6) of ``apply(x) = right``; at most 300 products."""
+    """Solution (F, 6) of ``apply(x) = right``, to a hundredth; at most 300 products."""
     x, r = np.zeros_like(right), right.copy()
     z = precondition(r)
     p, rz = z, float((r * z).sum())
-    goal = tolerance**2 * rz
+    goal = 1e-2**2 * rz
     for _ in range(300):
         if not rz > goal:
             break

@@ -99,10 +99,9 @@ def _refuse_too_few(frame: NDArray[np.int64], path: Path) -> None:
 def _noise(seen: Observations, structure: Structure) -> Array:
     """Residuals (M, 3) as large as the noise behind them.
 
-    The fit takes 3 degrees of freedom for each landmark and 6 for each pose. What two frames say of their motion does
-    not depend on where the landmarks are, so residuals keep it whole (of a point seen twice they hold the difference
-    of both measurements, exactly). What the pose took is given back: a frame whose observations have ``n`` degrees of
-    freedom beside the landmarks keeps ``n - 6`` of them.
+    What two frames say of their motion does not depend on where the landmarks are, so residuals keep it whole (of a
+    point seen twice they hold the difference of both measurements, exactly). What the pose took of a frame's ``n``
+    degrees of freedom beside the landmarks, 6, is given back.
     """
     used = structure.weight > 0
     length = np.bincount(seen.track, used, minlength=len(structure.points_world))
@@ -194,11 +193,9 @@ def rig_errors(settings: TwinSettings) -> Array:
 
 
 def _projected(original: Original, settings: TwinSettings, replicate: int) -> tuple[Array, Array]:
-    """Left and right pixels (M, 2) of the landmarks in the rig of a twin, without noise.
-
-    Baseline and focal length are drawn from the tolerance; what displaces the right image from what odometry found of
-    its rig, mean and covariance; where it looked for nothing (without self-calibration), as a turn from the tolerance.
-    """
+    """Left and right pixels (M, 2) of the landmarks in the rig of a twin, without noise: its baseline and focal length
+    are drawn from the tolerance, what displaces its right image from what odometry found, or if that looked for nothing
+    (without self-calibration), as a turn from the tolerance."""
     seen, known = original.seen, original.rig
     e, camera = rig_errors(settings)[replicate], seen.camera
     tolerance = replace(settings.tolerance, rotation_rad=0.0) if known.covariance.any() else settings.tolerance

@@ -202,7 +202,6 @@ class VoLog:
         return iter(self.records)
 
     def _each(self, name: str) -> NDArray[Any] | list[Any]:
-        """One field of every record."""
         if isinstance(self.records, StoredRecords):
             return self.records.columns[name]
         return [getattr(r, name) for r in self.records]

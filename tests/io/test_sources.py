@@ -671,5 +671,5 @@ def test_sources_of_other_packages(monkeypatch):
         def load():
             return dict
 
-    monkeypatch.setattr("gpvo.io.source.entry_points", lambda group: [Entry] if group == "gpvo.sources" else [])
+    monkeypatch.setattr("importlib.metadata.entry_points", lambda group: [Entry] if group == "gpvo.sources" else [])
     assert source_kinds.__wrapped__()["mine"]() is dict

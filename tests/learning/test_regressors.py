@@ -160,7 +160,7 @@ def test_regressors_of_other_packages_join(monkeypatch: pytest.MonkeyPatch) -> N
         def load() -> type[Regressor]:
             return SparseRegressor
 
-    monkeypatch.setattr("gpvo.learning.regressors.entry_points", lambda group: [Entry()])
+    monkeypatch.setattr("importlib.metadata.entry_points", lambda group: [Entry()])
     assert "mine" in regressor_names()
     assert get_regressor("mine", inducing=7).inducing == 7
 

@@ -25,13 +25,21 @@ from gpvo.io import open_source
 from gpvo.io.run import Run, read_run, write_run
 from gpvo.learning import train as training
 from gpvo.learning.basefit import rate_changes
-from gpvo.learning.card import model_card
 from gpvo.learning.config import TrainConfig
 from gpvo.learning.fit import Learned, fit_model
 from gpvo.learning.methods import METHODS, best_scale, score
 from gpvo.learning.parts import fit_parts
 from gpvo.learning.rows import Rows, checked
-from gpvo.learning.store import card_path, config_of, folds_path, picture_path, rows_path, save_model, update
+from gpvo.learning.store import (
+    card_path,
+    config_of,
+    folds_path,
+    model_card,
+    picture_path,
+    rows_path,
+    save_model,
+    update,
+)
 from gpvo.learning.train import TrainedModel, _slips, train_sets, unseen_axes
 from gpvo.online.base import COASTED, TWIST_COLUMNS
 from gpvo.online.division import divide

@@ -107,7 +107,7 @@ def test_check_of_the_others(odometry: list[Odometry]) -> None:
     # VISION_SPEED_ESTIMATE's covariance is taken for one sigma, the root of its trace, but not below the parameter.
     assert "Set VISO_VEL_M_NSE to 0.05, the smallest it accepts" in speed.advice
     assert speed.hidden_percent == 100.0
-    assert speed.predicted == pytest.approx(((3e-4) ** 0.5,) * 3)
+    assert speed.predicted_sigma == pytest.approx(((3e-4) ** 0.5,) * 3)
     loud = [replace(o, twist_covariance=np.eye(6) * 0.06**2) for o in odometry]
     assert consumers.check(loud, "ardupilot")[4].hidden_percent == 0.0
     assert all(v.hidden_percent == 0 for v in consumers.check(odometry, "robot_localization"))
@@ -131,7 +131,7 @@ def test_fusioncore_floors_a_pose_and_replaces_what_holds_a_zero(odometry: list[
     sharp = [replace(o, twist_covariance=np.eye(6), pose_covariance=np.eye(6) * 1e-8) for o in odometry]
     twist, pose = consumers.check(sharp, "fusioncore")
     assert (twist.hidden_percent, pose.hidden_percent) == (0.0, 100.0)
-    assert pose.predicted == pytest.approx((1e-4, 1e-4, 1e-4))
+    assert pose.predicted_sigma == pytest.approx((1e-4, 1e-4, 1e-4))
 
 
 def test_fusioncore_loses_what_lies_in_correlations(odometry: list[Odometry]) -> None:

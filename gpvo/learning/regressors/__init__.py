@@ -3,13 +3,11 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from importlib import import_module
-from importlib.metadata import EntryPoint, entry_points
 from typing import Any, Protocol
 
 import numpy as np
 
-from gpvo.errors import GpvoError
+from gpvo.errors import GpvoError, plugins
 from gpvo.online.projected import ProjectedGP
 from gpvo.types import Array
 
@@ -115,7 +113,7 @@ _BUILT_IN = {
     "exact": "gpvo.learning.regressors.sparse:exact",
     "sparse": "gpvo.learning.regressors.sparse:SparseRegressor",
     "svgp": "gpvo.learning.regressors.svgp:SvgpRegressor",
-    "sklearn": "gpvo.learning.regressors.sklearn_gp:SklearnRegressor",
+    "sklearn": "gpvo.learning.regressors.sparse:SklearnRegressor",
 }
 
 
@@ -126,11 +124,7 @@ def regressor_names() -> tuple[str, ...]:
     follows :class:`Regressor`, takes options as keywords, and is chosen by ``gpvo train --regressor name``. A built-in
     name cannot be overridden.
     """
-    return (*_BUILT_IN, *sorted(_outside().keys() - _BUILT_IN.keys()))
-
-
-def _outside() -> dict[str, EntryPoint]:
-    return {entry.name: entry for entry in entry_points(group="gpvo.regressors")}
+    return (*_BUILT_IN, *sorted(plugins("gpvo.regressors", {}).keys() - _BUILT_IN.keys()))
 
 
 def get_regressor(name: str, *, n_rows: int | None = None, **options: Any) -> Regressor:
@@ -142,12 +136,7 @@ def get_regressor(name: str, *, n_rows: int | None = None, **options: Any) -> Re
     """
     if name == "auto":
         name = "exact" if n_rows is not None and n_rows <= EXACT_ROWS else "sparse"
-    if name in _BUILT_IN:
-        module, _, attribute = _BUILT_IN[name].partition(":")
-        found = getattr(import_module(module), attribute)
-    else:
-        outside = _outside()
-        if name not in outside:
-            raise GpvoError(f"unknown regressor '{name}'", cure=f"one of: auto, {', '.join(regressor_names())}")
-        found = outside[name].load()
-    return found(**options)
+    known = plugins("gpvo.regressors", _BUILT_IN)
+    if name not in known:
+        raise GpvoError(f"unknown regressor '{name}'", cure=f"one of: auto, {', '.join(regressor_names())}")
+    return known[name]()(**options)

@@ -103,7 +103,6 @@ def _negative_bound(model: Any, log_noise: Tensor, X: Tensor, Y: Tensor, n_rows:
 
 
 def _minibatches(Xs: Array, Ys: Array, size: int, seed: int) -> Iterator[tuple[Tensor, Tensor]]:
-    """Shuffled pieces of ``size`` rows, without end."""
     rng = np.random.default_rng(seed)
     while True:
         order = rng.permutation(len(Xs))

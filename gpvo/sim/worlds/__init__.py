@@ -188,10 +188,8 @@ class TriangleDistance:
 
 
 def _closest_on_triangles(p: Array, a: Array, b: Array, c: Array) -> Array:
-    """Nearest point of triangles ``a b c`` to ``p``, all (..., 3).
-
-    Christer Ericson, Real-Time Collision Detection (2005), section 5.1.5.
-    """
+    """Nearest point of triangles ``a b c`` to ``p``, all (..., 3): C. Ericson, "Real-Time Collision Detection" (2005),
+    section 5.1.5."""
     ab, ac, ap, bp, cp = b - a, c - a, p - a, p - b, p - c
     d1, d2 = (ab * ap).sum(-1), (ac * ap).sum(-1)
     d3, d4 = (ab * bp).sum(-1), (ac * bp).sum(-1)
