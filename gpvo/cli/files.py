@@ -13,7 +13,6 @@ from gpvo.cli import common as options
 from gpvo.cli.describe import as_lines, describe
 from gpvo.cli.output import Json, answer, note, numbers, one_of, progress
 from gpvo.cli.output import time_offset as read_offset
-from gpvo.dataset.build import aligned
 from gpvo.dataset.clock import estimate_time_offset
 from gpvo.dataset.errors import interpolate_truth
 from gpvo.dataset.hand_eye import FixedTransform, align_frames
@@ -127,6 +126,8 @@ def add_truth(
     ``align``, ``time_offset_s``: as for :func:`import_log`, but it is truth that is moved, to the run's clock and
     frame: records, IMU and tracks stay as they are. Raises SourceError: one line that names the file and the cure.
     """
+    from gpvo.dataset.build import aligned
+
     given, path = run.truth, run.path
     if truth is not None:
         given, path = TruthLog(truth.t_ns, truth.trajectory.T_world_body), truth.path

@@ -19,7 +19,7 @@ from gpvo.evaluation.evaluate import Evaluation
 from gpvo.evaluation.forecast import Forecast
 from gpvo.evaluation.fusion import Trace, nis_band, nis_over_runs
 from gpvo.evaluation.panels import Drawing, Panel, colour, line
-from gpvo.files import refuse_foreign, replacing
+from gpvo.files import Own, refuse_foreign, replacing
 
 PLOT = (b"atplotlib", "plot")
 _SIGNATURE = {"jpg": {"comment": b"Matplotlib"}, "tif": {"tiffinfo": {305: "Matplotlib"}}}
@@ -161,10 +161,11 @@ def _innovations(traces: Sequence[Trace]) -> Panel:
     return panels.panel(title, "time [s]", "NIS / 6", lines, bands=bands, log="y")
 
 
-def save(figure: Figure, path: Path, **options: Any) -> None:
-    """Write to an image file, whole or not at all; ``options``: of matplotlib's ``savefig``."""
+def save(figure: Figure, path: Path, own: Own | None = PLOT, **options: Any) -> None:
+    """Write to an image file, whole or not at all; what is not of its ``own`` kind is not replaced. ``options``: of
+    Matplotlib's ``savefig``."""
     kind = path.suffix[1:].lower()
     if kind in _SIGNATURE:
         options["pil_kwargs"] = _SIGNATURE[kind]
-    with replacing(path, PLOT) as temporary:
+    with replacing(path, own) as temporary:
         figure.savefig(temporary, format=kind, **options)

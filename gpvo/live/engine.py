@@ -5,7 +5,6 @@ What it keeps in a file lets a restart continue from it.
 
 from __future__ import annotations
 
-import os
 import re
 import struct
 import time
@@ -19,7 +18,7 @@ import numpy as np
 
 from gpvo.dataset.check import odometry_problems, rate_problems
 from gpvo.errors import GpvoError
-from gpvo.files import read_json, write_json
+from gpvo.files import read_json, refuse_foreign, write_json
 from gpvo.geometry import se3
 from gpvo.geometry.covariance import are_semidefinite, lost_covariance, symmetrise
 from gpvo.geometry.se3 import is_rigid, rotate_covariance
@@ -353,8 +352,7 @@ def load_state(path: Path | None) -> KeptState | None:
     cannot be, and where no file can be written."""
     if path is None:
         return None
-    if not os.access(path.parent, os.W_OK):
-        raise GpvoError("cannot be written: no such folder, or no permission", where=path, cure="give another --state")
+    refuse_foreign(path, b"", "state")
     if not path.exists():
         return None
     try:

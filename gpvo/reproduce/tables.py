@@ -13,7 +13,7 @@ from matplotlib.figure import Figure
 
 from gpvo.evaluation.panels import line, panel
 from gpvo.evaluation.plots import figure_of, save
-from gpvo.files import columns_of, make_folder, markdown_table, templates
+from gpvo.files import columns_of, markdown_table, templates
 from gpvo.reproduce.bounds import Bounds
 from gpvo.reproduce.models import Studies
 from gpvo.reproduce.rows import Cell
@@ -139,9 +139,7 @@ def draw(cells: Sequence[Cell], studied: Studies | None, store: Store, out: Path
     drawn: list[dict[str, str]] = []
 
     def keep(name: str, title: str, figure: Figure) -> None:
-        path = out / "figures" / f"{name}.png"
-        make_folder(path.parent)
-        save(figure, path, dpi=100, metadata={"Software": None})
+        save(figure, out / "figures" / f"{name}.png", own=None, dpi=100, metadata={"Software": None})
         drawn.append({"file": f"figures/{name}.png", "title": title})
 
     simulated: dict[tuple[str, str], list[Cell]] = {}

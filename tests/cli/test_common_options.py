@@ -199,7 +199,7 @@ def test_several_runs_are_predicted_and_judged_together(tmp_path: Path):
     shutil.copytree(runs[0], tmp_path / "run")
     refused = gpvo("predict", MODEL, str(tmp_path / "run"), "-o", str(tmp_path / "run" / "truth.parquet"))
     assert refused.returncode == 2
-    assert "is part of a run" in refused.stderr
+    assert "is another file, not an earlier file of predictions" in refused.stderr
     told = gpvo("evaluate", *runs).stdout
     assert "mean of the 3 runs" in told
     assert "NEES with the truth's own noise taken into account, NLL without" in told

@@ -522,6 +522,7 @@ def test_a_link_that_is_down_and_a_state_that_cannot_be_saved_end_nothing(tmp_pa
     for k, arrival in enumerate(flown(stamps, T)):
         if k == 1:
             shutil.rmtree(folder)
+            folder.touch()  # a file where its folder was
         live.take(replace(arrival, received_ns=k * 10**9))
     assert len(kept.frames) == len(T)
     assert live.counts["output_failed"] == 10
@@ -531,7 +532,7 @@ def test_a_link_that_is_down_and_a_state_that_cannot_be_saved_end_nothing(tmp_pa
     with pytest.raises(GpvoError, match="no space left"):
         live.close()
     assert closed
-    with pytest.raises(GpvoError, match="no such folder"):
+    with pytest.raises(GpvoError, match="is no folder"):
         engine(settings)
 
 
