@@ -330,6 +330,5 @@ def test_a_terminal_is_told_what_is_done_and_left_as_it_was(
     if quiet:
         assert told.getvalue() == ""
     else:
-        assert "reading" in told.getvalue()
         assert "flight0" in told.getvalue()
         assert told.getvalue().endswith("\x1b[2K")  # the line is empty again
