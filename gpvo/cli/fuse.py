@@ -10,7 +10,7 @@ from typing import Annotated
 import typer
 
 from gpvo.cli.common import refuse_twice
-from gpvo.cli.output import Json, answer, one_of, print_json, progress, say
+from gpvo.cli.output import Json, answer, one_of, print_json, progress, say, status
 from gpvo.cli.twin import Seed, TwinOptions, Twins, in_place_of_runs_without_truth, say_simulated
 from gpvo.publish import PublishSettings
 
@@ -65,11 +65,12 @@ def fuse(
     with (
         in_place_of_runs_without_truth(runs, judging) as flown,
         in_place_of_runs_without_truth(train or [], teaching) as taught,
+        status("reading") as tell,
     ):
         report = fuse_runs(
             flown,
             replace(settings, training=tuple(taught)),
-            tell=_tell,
+            tell=tell,
             on_run=lambda fused: write_log(log / f"{fused.name}_{fused.policy}.csv", fused) if log else None,
         )
     for warning in report.warnings:
@@ -106,9 +107,3 @@ def publish(
     with progress("runs", 1):
         result = publish_run(run, options)
     answer(json_, result.document(), lambda: list(map(say, str(result).splitlines())))
-
-
-def _tell(what: str) -> None:
-    """One line of progress on a terminal; silence in a pipe."""
-    if sys.stderr.isatty():
-        print(f"\r\033[K{what}", end="\r", file=sys.stderr, flush=True)

@@ -10,10 +10,13 @@ import textwrap
 import time
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import contextmanager
-from typing import Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any
 
 from gpvo.errors import GpvoError
 from gpvo.files import plain
+
+if TYPE_CHECKING:
+    from rich.console import Console
 
 Json = Annotated[bool, "Print the result as JSON."]
 _MOST = 1e10  # of any number on a command line: metres, seconds
@@ -125,16 +128,29 @@ def cell(value: float | str | None, digits: int = 3) -> str:
 
 
 @contextmanager
+def status(what: str) -> Iterator[Callable[[str], None]]:
+    """A line on a terminal that says what is done while it is, from the start on; silence in a pipe, or with ``-q``.
+
+    Yields the function to call with what is done next.
+    """
+    from rich.text import Text
+
+    if (console := _terminal()) is None:
+        yield lambda _: None
+        return
+    with console.status(Text(what)) as line:  # as text: names of runs may hold brackets
+        yield lambda what: line.update(Text(what))
+
+
+@contextmanager
 def progress(what: str, total: int | None = None) -> Iterator[Callable[..., None]]:
-    """A progress bar with the time left on a terminal, silence in a pipe.
+    """A progress bar with the time left on a terminal; silence in a pipe, or with ``-q``.
 
     Yields the function to call once per item, or with how many are done, of how many.
     """
-    from rich.console import Console
     from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 
-    console = Console(stderr=True)
-    if _loud["quiet"] or not console.is_terminal:
+    if (console := _terminal()) is None:
         yield lambda done=None, total=None: None
         return
     columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn())
@@ -146,3 +162,11 @@ def progress(what: str, total: int | None = None) -> Iterator[Callable[..., None
             bar.update(task, advance=1 if done is None else None, completed=done, total=total)
 
         yield tell
+
+
+def _terminal() -> Console | None:
+    """Standard error, where somebody looks at it and wants to see how far the work is."""
+    from rich.console import Console
+
+    console = Console(stderr=True)
+    return console if console.is_terminal and not _loud["quiet"] else None

@@ -71,7 +71,8 @@ def _on_grid(poses: TruthLog, step_s: float, window: int) -> tuple[Array, int]:
 
 
 def _gap_s(poses: TruthLog) -> float:
-    """The longest gap that is interpolated over: of slow poses a step and a half."""
+    """The longest gap that is interpolated over: of slow poses a step and a half, longer than what errors are told by
+    (``dataset.errors``), as only the time of the motions is asked for and without slow poses nothing tells it."""
     return max(MAX_GAP_S, 1.5e-9 * float(np.median(np.diff(poses.t_ns))))
 
 

@@ -19,7 +19,8 @@ from gpvo.types import Array, TruthLog, VoLog, VoRecord
 
 MAX_GAP_S = 0.5
 _GAP_STEPS = 3.0
-"""Usual steps, of truth or frames, that the truth is interpolated over, if at most ``MAX_GAP_S``."""
+"""Usual steps, of truth or frames, that the truth is interpolated over, if at most ``MAX_GAP_S``: a pose must be
+exact enough to judge a motion by, which the filter's guesses over a gap of the IMU need not (``filters.plausible``)."""
 # Of the truth's noise:
 _ORDER = 3
 """Differences of the poses. Vehicles have little of a third one at 10 Hz, where white noise has the most."""

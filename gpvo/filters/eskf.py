@@ -232,7 +232,7 @@ class ErrorStateFilter:
         r = residual - (H @ self.dx[:, :, None])[:, :, 0]
         PHt = self.P @ transpose(H)
         HPHt = H @ PHt
-        R = R + self._rounding(H, HPHt, R)
+        R = self._with_rounding(H, HPHt, R)
         S = HPHt + R
         L = np.asarray(np.linalg.cholesky(S), dtype=np.float64)
         whitened: Array = np.linalg.solve(L, np.concatenate([transpose(PHt), r[:, :, None]], axis=2))
@@ -260,13 +260,13 @@ class ErrorStateFilter:
             self.dx += (K @ r[:, :, None])[:, :, 0]
         return Innovation(r, S, nis, passed, used, own_fault)
 
-    def _rounding(self, H: Array, HPHt: Array, R: Array) -> Array:
-        """(B, m, m) by what a motion is read off less well where it is the small difference of two places, so unsure
-        that their variance leaves its own too few digits; zero where these are enough."""
+    def _with_rounding(self, H: Array, HPHt: Array, R: Array) -> Array:
+        """``R`` (b, m, m), more where a motion is the small difference of two places, so unsure that their variance
+        leaves its own too few digits: by what it is read off less well."""
         places = variances(self.P)[:, P].max(axis=1)[:, None] * np.square(H[:, :, P]).sum(axis=2)
         lost = np.finfo(float).eps * places
         spoilt = ((lost > _SPOILT * variances(R)) & (variances(HPHt) < _SMALL * places)).any(axis=1)
-        return np.asarray((_ROUNDINGS * spoilt[:, None] * lost)[:, :, None] * np.eye(H.shape[1]))
+        return R + (_ROUNDINGS * spoilt[:, None] * lost)[:, :, None] * np.eye(H.shape[1]) if spoilt.any() else R
 
     def _own_part(self, H: Array, S: Array, r: Array) -> Array:
         """How much of the NIS (B,) state and clone have to answer for (see the gate's ``Wait``)."""

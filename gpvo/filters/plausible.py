@@ -24,7 +24,8 @@ _LEAST_STEP = np.repeat([3.0, 30.0], 3)  # [rad/s, m/s^2] that two samples may a
 _STUCK = 8  # samples with the very same reading: a sensor has noise, and held ones repeat two or four times
 _TIMES_USUAL = 20.0  # the usual step that they may differ by, where that is more
 _FORGET = 0.02
-# An interval this many times the usual one, and at least this long, is a gap.
+# An interval this many times the usual one, and at least this long, is a gap: from it on readings are guessed. Where
+# truth may be interpolated, or a stretch be judged whole, is asked of slower data (dataset.errors, filters.start).
 _GAP_FACTOR, GAP_S = 5.0, 0.05
 _NEARBY = 1000  # samples that tell how far a guess over a gap may be off
 

@@ -16,7 +16,9 @@ from gpvo.stats.series import integral, interpolated, median
 from gpvo.types import STANDARD_GRAVITY_MPS2, Array, ImuLog
 
 _SLOPE_POSES = 5  # true poses that the velocity at the start is taken from
-_GAP_S, _GAP_STEPS = 1.0, 10.0  # stamps are missing where they are further apart than both
+# Stamps are missing where they are further apart than both. Of both truth and IMU, for an integral that a few lost
+# samples do not spoil: so longer than what a filter guesses over (filters.plausible), or interpolates (dataset.errors).
+_GAP_S, _GAP_STEPS = 1.0, 10.0
 _STRETCH_S, _STRETCHES = 1.0, 15  # that the vertical is measured over: at least so long, at most so many
 _ROUNDS, _HUBER = 10, 2.0  # of reweighting; a stretch further off, in sigmas of its three axes together, counts less
 _MEDIAN_OF_NORM = 1.54  # of three standard normal numbers

@@ -151,11 +151,16 @@ class Timeline:
         for rival, its in zip(self._rivals, told, strict=True):
             rival.hear(its, self, steps)
         if won := next((rival for rival in self._rivals if rival.has_won(self.gate)), None):
-            self.__dict__.update(won.line.__dict__)
-            self.counts["clock_set_ahead" if won.set_ns > 0 else "clock_set_back"] += 1
-            return won.steps
+            return self._adopt(won)
         self._rivals = [rival for rival in self._rivals if rival.is_open()]
         return steps
+
+    def _adopt(self, won: Rival) -> list[Step]:
+        """Go on as the timeline that the motions speak for, and return its steps: it was copied from this one, so all
+        that this one holds has its like there, and other rivals, which took its clock not to be set, end."""
+        vars(self).update(vars(won.line))
+        self.counts["clock_set_ahead" if won.set_ns > 0 else "clock_set_back"] += 1
+        return won.steps
 
     def _suspect(self, record: VoRecord) -> None:
         """Follow what would be if VO's clock alone had been set, where its stamps do not go on from the newest one and

@@ -108,6 +108,7 @@ class Engine:
         self._builder: OdometryBuilder | None = None
         self._seen_ns: int | None = None  # arrival of the last message that was used
         self._now_s, self._used_s = time.monotonic(), np.nan  # of the messages' clock: a recording has its own
+        self._used_counts: Counter[str] = Counter()  # of the stage, when a message was last used
         self._latency_ms: deque[float] = deque(maxlen=1000)
         self._motions: deque[VoRecord] = deque(maxlen=_RECENT)
         self._inside: deque[bool] = deque(maxlen=_RECENT)
@@ -192,6 +193,7 @@ class Engine:
         message = builder.step(record, prediction)
         message = replace(message, frame_id=taken.frame_id, child_frame_id=taken.child_frame_id)
         self._seen_ns, self._used_s, self.last = taken.received_ns, taken.received_ns * 1e-9, message
+        self._used_counts = self.stage.counts.copy()
         self._twist = self._twist if message.twist_body is None else message.twist_body
         self.counts[f"frames_{message.status.value}"] += 1
         if record.dt_s > 0:
@@ -250,8 +252,9 @@ class Engine:
             self._misfit = self._misfits()
         silence = []
         if self._now_s - self._used_s > _STALE_S:
-            never = f": nothing received on {', '.join(self._unheard)}" if self._unheard else ""
-            silence = [f"no usable message for more than {_STALE_S:.0f} s{never}"]
+            why = [f"nothing received on {', '.join(self._unheard)}"] if self._unheard else []
+            why += [f"{n} {name}" for name, n in (self.stage.counts - self._used_counts).most_common()]
+            silence = [f"no usable message for more than {_STALE_S:.0f} s{': ' if why else ''}{', '.join(why)}"]
         problems = [*silence, *self._misfit]
         for text in problems:
             self._warn(text)

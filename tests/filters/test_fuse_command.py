@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import io
 import json
+import sys
 from dataclasses import replace
 from pathlib import Path
 
@@ -306,3 +308,27 @@ def test_truth_where_there_is_no_imu_is_no_truth(tmp_path: Path) -> None:
     assert np.linalg.norm(trace.position, axis=1).max() < 1.0
     assert "no frame covered by the IMU has ground truth" in "".join(report.warnings)
     assert "pointing_matching" not in "".join(report.warnings)
+
+
+class _Terminal(io.StringIO):
+    def isatty(self) -> bool:
+        return True
+
+
+@pytest.mark.parametrize("quiet", [False, True])
+def test_a_terminal_is_told_what_is_done_and_left_as_it_was(
+    quiet: bool, runs: list[Path], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    arguments = ["fuse", str(runs[0]), "--policies", "pointing_matching", "--json"]
+    for name in ("NO_COLOR", "FORCE_COLOR", "TTY_COMPATIBLE", "TTY_INTERACTIVE"):
+        monkeypatch.delenv(name, raising=False)
+    monkeypatch.setenv("TERM", "xterm")
+    monkeypatch.setattr(sys, "stderr", told := _Terminal())
+    with pytest.raises(SystemExit) as ended:
+        app([*arguments, *(["-q"] if quiet else [])])
+    assert not ended.value.code
+    if quiet:
+        assert told.getvalue() == ""
+    else:
+        assert "flight0" in told.getvalue()
+        assert told.getvalue().endswith("\x1b[2K")  # the line is empty again

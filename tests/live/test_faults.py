@@ -222,6 +222,43 @@ def test_silence_from_the_start_names_the_topics_that_sent_nothing() -> None:
     assert told == [f"no usable message for more than 2 s: nothing received on {TOPIC}"]
 
 
+def _without_stamps(arrival: Arrival) -> Arrival:
+    header = arrival.message.header
+    return replace(
+        arrival, message=replace(arrival.message, header=replace(header, stamp=replace(header.stamp, sec=0, nanosec=0)))
+    )
+
+
+def _turned_by_no_rotation(arrival: Arrival) -> Arrival:
+    holder = arrival.message.pose
+    turn = replace(holder.pose.orientation, w=2.0)
+    return replace(
+        arrival, message=replace(arrival.message, pose=replace(holder, pose=replace(holder.pose, orientation=turn)))
+    )
+
+
+@pytest.mark.parametrize(
+    ("before", "spoil", "told"),
+    [
+        (0, _without_stamps, "repeated"),
+        (20, _without_stamps, "clock"),
+        (0, _turned_by_no_rotation, "absurd"),
+        (20, _turned_by_no_rotation, "absurd"),
+    ],
+)
+def test_messages_that_cannot_be_used_say_why_nothing_follows(
+    before: int, spoil: Callable[[Arrival], Arrival], told: str, recording: list[Arrival]
+) -> None:
+    """A driver that never stamps, or quaternions that are not normalised: what is counted since the last good one."""
+    live, kept, warned = engine()
+    for arrival in [*recording[:before], *(spoil(m) for m in recording[before:])]:
+        live.take(arrival)
+    assert kept.reports[-1].level == 2
+    silent = [text for text in warned if text.startswith("no usable message")]
+    assert len(silent) == 1
+    assert silent[0].endswith(f" {told}") or f" {told}," in silent[0]
+
+
 def test_the_end_of_a_recording_is_no_silence() -> None:
     """Its clock need not be this machine's: a published run begins at zero."""
     live, _, told = engine()
