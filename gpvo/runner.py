@@ -185,12 +185,12 @@ def _content(source: Source) -> list[object]:
     lie elsewhere and not show in the rectified camera.
 
     Whoever changes a file can set its time of modification back, as copying tools do, but not that of its last change
-    (``ctime``), and another file in its place has another number. A file that was only touched counts as changed, too:
-    the run then begins anew.
+    (``ctime``), which another file in its place has from when it was put there. A file that was only touched counts as
+    changed, too: the run then begins anew.
     """
     path = Path(source.path)
     stats = ((p, p.stat()) for p in ([path] if path.is_file() else _files(path)))
-    known = [(str(p.relative_to(path.parent)), s.st_size, s.st_mtime_ns, s.st_ctime_ns, s.st_ino) for p, s in stats]
+    known = [(str(p.relative_to(path.parent)), s.st_size, s.st_mtime_ns, s.st_ctime_ns) for p, s in stats]
     return [source.format, known, source.imu, source.truth, source.calibration]
 
 
