@@ -63,7 +63,7 @@ _AXIS = "roll|pitch|yaw|[prt]?[xyz]|r|p"
 _COVARIANCE = re.compile(rf"(?:pose_|position_)?(?:cov|covariance)_({_AXIS})_?({_AXIS})")
 _POSED = re.compile(r"(?:.*_)?(p|t|pos|position|translation|q|quat|ori|orientation|rotation)(?:_rs_r|_rs)?_?([xyzw])")
 _VARIANCE = re.compile(rf"(?:pose_|position_)?(?:var|variance)_({_AXIS})")
-_UNCERTAIN = re.compile(r"cov|var|sigma|std", re.IGNORECASE)
+_UNCERTAIN = re.compile(r"cov|var|sigma|std|^p_?\d\d$", re.IGNORECASE)
 
 
 @dataclass(frozen=True)

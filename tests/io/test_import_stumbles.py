@@ -170,3 +170,11 @@ def test_tum_lines_with_decimal_commas_are_named_as_such(read: Callable[[Path], 
     path.write_text("".join(f"{k},5 0,1 0,2 0,3 0,0 0,0 0,0 1,0\n" for k in range(3)))
     with pytest.raises(SourceError, match=r"'0,5' is not a number \(write numbers with a decimal point\)"):
         read(path)
+
+
+@pytest.mark.parametrize("names", ["P11,P22,P66", "p_00,p_11", "sigma_x,sigma_y"])
+def test_an_uncertainty_that_nothing_reads_is_named(names: str, tmp_path: Path) -> None:
+    path = tmp_path / "log.csv"
+    more = ",0.01" * len(names.split(","))
+    path.write_text(f"{HEAD},{names}\n0.0,{POSE}{more}\n0.1,{POSE}{more}\n")
+    assert any(f"columns not used: {names.replace(',', ', ')};" in note for note in read_foreign(path).notes)
