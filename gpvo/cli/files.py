@@ -246,7 +246,7 @@ def import_(
     fit: dict[str, Any] = {"align": align, "time_offset_s": offset, "truth_sigma": sigma, "overwrite": overwrite}
     with progress("logs", 1):
         given = None if truth is None else read(truth, truth_format, **of_truth)
-        if is_run(log):
+        if is_run(log) or log.suffix == ".parquet":  # a run's own table is no log, as reading it as a run says
             _refuse_of_a_run(log, {"frame": frame != "auto", "format": format_, "map": map_, "topic": topic})
             summary = add_truth(read_run(log), given, out, **fit)
         else:

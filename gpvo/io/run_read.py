@@ -87,7 +87,8 @@ def read_run(path: str | Path | Run) -> Run:
     p = Path(path)
     if not p.is_dir():
         what = "is a file, not a run folder" if p.exists() else "no such run folder"
-        raise SourceError(what, where=p, cure="make one with 'gpvo run SOURCE -o RUN'")
+        cure = f"give its folder, {p.parent}" if is_run(p.parent) else "make one with 'gpvo run SOURCE -o RUN'"
+        raise SourceError(what, where=p, cure=cure)
     if not (p / "run.json").is_file():
         raise SourceError("is not a run folder: it lacks run.json", where=p, cure="make one with 'gpvo run'")
     meta = read_meta(p)

@@ -144,3 +144,10 @@ def test_a_folder_that_is_no_run_is_left_alone(run: Path, tmp_path: Path) -> Non
     assert code != 0
     assert "not a run" in err
     assert [p.name for p in out.iterdir()] == ["thesis.tex"]
+
+
+@pytest.mark.parametrize("words", [("import", "-o", "new"), ("evaluate",)], ids=lambda words: words[0])
+def test_a_table_of_a_run_points_to_its_folder(run: Path, words: tuple[str, ...]) -> None:
+    done = CliRunner().invoke(app, [words[0], str(run / "vo_log.parquet"), *words[1:]])
+    assert done.exit_code != 0
+    assert f"give its folder, {run}" in str(done.exception)
