@@ -132,7 +132,7 @@ class _Rows(Sequence[T], Generic[T]):
     def __getitem__(self, k: Any) -> Any:
         if not -self.n <= k < self.n:
             raise IndexError(k)
-        return self.made(k)
+        return self.made(k % self.n)
 
 
 def _translation_alone(log: VoLog, method: str) -> Array:

@@ -13,7 +13,7 @@ from evaluation_runs import make_run, stated_covariance
 from gpvo.dataset.errors import interpolate_truth, motion_errors
 from gpvo.evaluation import consistency as module
 from gpvo.evaluation.consistency import Consistency, consistency, horizon, truth_noise
-from gpvo.evaluation.statements import predicted_statement, statements
+from gpvo.evaluation.statements import Statement, predicted_statement, statements
 from gpvo.geometry import se3
 from gpvo.io.run import read_run, write_run
 from gpvo.online.predictor import Predictor
@@ -225,3 +225,13 @@ def test_methods_of_a_long_run_are_made_when_they_are_asked_for(tmp_path: Path) 
     np.testing.assert_array_equal(first, second)
     assert len(first) > 4
     assert max(held) < 3 * 8 * 36 * len(log)
+
+
+def test_statements_are_counted_from_either_end() -> None:
+    log, _ = make_run(20)
+    mine = Statement("mine", np.zeros((20, 6)), np.tile(np.eye(6), (20, 1, 1)), None)
+    stated = statements(log, further=[mine])
+    assert [stated[k].method for k in range(-len(stated), 0)] == [s.method for s in stated]
+    assert stated[-1] is mine
+    with pytest.raises(IndexError):
+        stated[len(stated)]
