@@ -137,7 +137,8 @@ def add_truth(
     if truth_sigma is not None:
         given = TruthLog(given.t_ns, given.T_world_cam, *truth_sigma)
     run, offset_s = aligned(replace(run, truth=given), "none", time_offset_s)
-    given, fixed = _fitted(flag_slips(run.log), run.truth or given, path, align)
+    log = run.log if align == "none" else flag_slips(run.log)
+    given, fixed = _fitted(log, run.truth or given, path, align)
     origin = {"file": path.name, "align": align, "time_offset_s": offset_s}
     copy_run(run, out, given, {"truth": origin}, overwrite=overwrite)
     return _summary(run.log, given, offset_s, fixed, _assumed(truth))

@@ -159,8 +159,10 @@ def evaluate_run(
     T_est = log.trajectory()
     made = statements(log, predictions, predictor, further)
     by_velocity = velocity_path(truth, log.t_ns) if options.truth_sigma is None else None
-    judge = partial(consistency, errors=errors, log=scored, T_true=T_true, known=known, noise_sigma=sigma)
-    found = list(map(partial(judge, by_velocity=by_velocity), made))  # each statement is let go before the next
+    judge = partial(
+        consistency, errors=errors, log=scored, T_true=T_true, known=known, noise_sigma=sigma, by_velocity=by_velocity
+    )
+    found = list(map(judge, made))  # each statement is let go before the next
     first = int(np.flatnonzero(known)[0])
     trajectory = trajectory_errors(
         log.t_ns[known], T_est[known], T_true[known], options.segments_m, np.flatnonzero(known)

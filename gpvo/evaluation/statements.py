@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
-from functools import partial
+from functools import cache, partial
 from typing import TYPE_CHECKING, Any, Generic, TypeVar
 
 import numpy as np
@@ -52,8 +52,8 @@ def statements(
     predictor: Predictor | None = None,
     further: Iterable[Statement] = (),
 ) -> Sequence[Statement]:
-    """All methods that can be stated of this log, and ``further`` ones; each is made whenever it is asked for, as those
-    of a long run would fill the memory.
+    """All methods that can be stated of this log, and ``further`` ones. Each is made whenever it is asked for, as all
+    of a long run would fill the memory; only that of the thesis' model is kept.
 
     Geometric ones from its records, each with its translation-only ``_vt``; ``constant``, ``_scaled`` and
     ``gp_thesis`` from the model file (null where it holds none); ``base`` from the model with its GP held at its mean
@@ -66,7 +66,7 @@ def statements(
     ]
     kept = list(further)
     if "thesis.scale" in arrays and predictor is not None and predictor.target == "frame":
-        makers.append(partial(_thesis, log, ThesisModel.of_file(arrays)))
+        makers.append(cache(partial(_thesis, log, ThesisModel.of_file(arrays))))  # which takes a hundred times as long
     if predictions and predictor is not None:
         makers.append(partial(predicted_statement, "base", log, predictor.base().replay(log)))
     if predictions:

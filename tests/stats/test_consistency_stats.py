@@ -68,6 +68,7 @@ def test_coverage_per_axis():
     e, C = _drawn(6)
     sigma = np.sqrt(np.diagonal(C, axis1=1, axis2=2))
     shares = np.array([0.6827, 0.9545, 0.9973])
+    np.testing.assert_allclose(coverage(e, sigma), shares, atol=0.005)
     # Within five standard deviations of the share of errors that are drawn apart.
     assert (np.abs(coverage(e, sigma) - shares) < 5 * np.sqrt(shares * (1 - shares) / N)).all()
     np.testing.assert_allclose(coverage(e, 10 * sigma, (1.0,)), [1.0], atol=1e-9)
