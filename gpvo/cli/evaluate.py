@@ -38,7 +38,8 @@ class JudgeOptions:
     truth: Annotated[Path | None, "Ground truth (TUM lines, left camera) to use instead of the run's own."] = None
     segments: Annotated[str | None, "Segment lengths [m]; default: 10,20,50,100, over 800 m 100 to 800."] = None
     truth_sigma: Annotated[
-        str | None, "Noise of the truth per pose: metres[,radians]; 0 for none. Estimated by default."
+        str | None,
+        "Noise of the truth per pose: metres[,radians[,seconds of jitter]]; 0 for none. Estimated by default.",
     ] = None
     align: Annotated[str, "Fit between log and truth: a fixed rotation, transform (with lever arm) or none."] = "none"
     time_offset: Annotated[str, "Seconds to add to the log's clock, or auto."] = "0"
@@ -51,9 +52,9 @@ class JudgeOptions:
         if self.segments is not None:
             lengths = tuple(numbers("--segments", self.segments, "give lengths above 0 in metres", least=1e-9))
         if self.truth_sigma is not None:
-            cure = "give metres, or metres,radians"
-            given = numbers("--truth-sigma", self.truth_sigma, cure, counts=(1, 2), least=0.0)
-            sigma = (given[0], given[1] if len(given) == 2 else 0.0)
+            cure = "give metres, metres,radians, or metres,radians,seconds"
+            given = numbers("--truth-sigma", self.truth_sigma, cure, counts=(1, 2, 3), least=0.0)
+            sigma = (*given, *(0.0,) * (3 - len(given)))
         return EvaluateOptions(lengths, sigma, self.align, time_offset(self.time_offset))
 
 
@@ -269,7 +270,7 @@ def _print_methods(d: dict[str, Any]) -> None:
     say("NLL: nats per axis, as a Gaussian; stated: under the stated density, where it has heavier tails.")
     if noisy:
         noise = f"{1e3 * sigma['translation_m']:.2g} mm, {1e3 * sigma['rotation_rad']:.2g} mrad per pose"
-        say(f"+truth: with the truth's own noise ({noise}, rms over axes) taken into account, as in column 1 s.")
+        say(f"All but NEES and its interval: with the truth's own noise ({noise}, rms over axes) taken into account.")
 
 
 def _print_pooled(pooled: dict[str, Any], runs: int) -> None:
@@ -282,5 +283,5 @@ def _print_pooled(pooled: dict[str, Any], runs: int) -> None:
     if rows:
         few = "" if runs > 2 else ": too few for an interval"
         say(f"mean of the {runs} runs{few}")
-        say("(NEES with the truth's own noise taken into account, NLL without)")
+        say("(with the truth's own noise taken into account)")
         show(("method", "NLL", "interval", "NEES", "interval"), rows)

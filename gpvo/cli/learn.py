@@ -13,7 +13,8 @@ import typer
 from gpvo.cli.common import is_given, refuse_twice
 from gpvo.cli.output import Json, cell, note, print_json, progress, say, show, time_offset
 from gpvo.cli.twin import TwinOptions, Twins, in_place_of_runs_without_truth
-from gpvo.dataset.errors import made_from_odometry, motion_errors, outweighed_by_truth
+from gpvo.dataset.errors import motion_errors
+from gpvo.dataset.truth_noise import made_from_odometry
 from gpvo.errors import GpvoError
 from gpvo.io.run import read_run
 from gpvo.io.run_read import read_meta
@@ -82,13 +83,12 @@ def train(
     if statements is not None:
         _check_statements(runs, settings, update)
     drawn = twin_options.asked(ctx, twins, options.seed)
-    noisy: list[str] = []
     with in_place_of_runs_without_truth(runs, drawn, jobs) as paths:
         with progress("models") as on_fit:
-            trained = _with_origin(_train(paths, settings, update, on_fit, noisy), paths, update)
+            trained = _with_origin(_train(paths, settings, update, on_fit), paths, update)
         if statements is not None:
             _write_statements(trained, paths, settings, statements)
-    _tell(trained, settings, noisy)
+    _tell(trained, settings)
     save_model(trained, out)
     document = {**trained.table, "model": str(out)}
     if json_:
@@ -101,8 +101,8 @@ def train(
         print(f"{out}: {kept} rows of {len(trained.sets)} run{'s' * (len(trained.sets) != 1)}{streamed}")
 
 
-def _tell(trained: TrainedModel, settings: dict[str, Any], noisy: list[str]) -> None:
-    """Notes on what a model could not learn; ``noisy``: runs whose truth cannot judge single motions."""
+def _tell(trained: TrainedModel, settings: dict[str, Any]) -> None:
+    """Notes on what a model could not learn, and on truths whose noise it did not."""
     from gpvo.learning.config import TrainConfig, lacking
     from gpvo.learning.train import unseen_axes
 
@@ -117,17 +117,16 @@ def _tell(trained: TrainedModel, settings: dict[str, Any], noisy: list[str]) -> 
                 f"gpvo: {name} holds no {', '.join(missing)}, as other runs do: the model does without them. If it is"
                 " another odometry's, train a model for each"
             )
-    if noisy:
+    if noisy := [s.name for s in trained.sets if s.told is not None]:
         note(
-            "gpvo: the noise of the ground truth outweighs the odometry's errors in single motions of"
-            f" {', '.join(noisy)}: for one motion the model states both together, over a distance only the odometry's,"
-            " as the noise does not add up"
+            f"gpvo: the ground truth of {', '.join(noisy)} is noisy: the model learns the odometry's errors without its"
+            " noise, and is judged with it ('gpvo evaluate' says how large it is)"
         )
 
 
-def _rows(paths: list[Path], config: TrainConfig, noisy: list[str]) -> Iterator[TrainingSet]:
+def _rows(paths: list[Path], config: TrainConfig) -> Iterator[TrainingSet]:
     """Of one run after the other, with a note if its poses or stamps, or those of its truth, seem not to be what they
-    are taken for; ``noisy`` gets the names of those whose truth cannot judge single motions."""
+    are taken for."""
     from gpvo.dataset.build import aligned
     from gpvo.dataset.misread import Misread, late_by
 
@@ -148,8 +147,6 @@ def _rows(paths: list[Path], config: TrainConfig, noisy: list[str]) -> Iterator[
                     " hardly any noise from it"
                 )
         yield as_is.rows_of(run)
-        if config.target == "frame" and run.truth is not None and outweighed_by_truth(run.log, run.truth):
-            noisy.append(run.name)
 
 
 def _check_statements(runs: list[Path], settings: dict[str, Any], update: Path | None) -> None:
@@ -178,10 +175,7 @@ def _with_origin(trained: TrainedModel, paths: list[Path], update: Path | None) 
     return replace(trained, header={**trained.header, "simulated_truth": origin}) if origin else trained
 
 
-def _train(
-    paths: list[Path], settings: dict[str, Any], update: Path | None, on_fit: OnFit, noisy: list[str]
-) -> TrainedModel:
-    """``noisy`` gets the names of runs whose truth cannot judge single motions."""
+def _train(paths: list[Path], settings: dict[str, Any], update: Path | None, on_fit: OnFit) -> TrainedModel:
     from gpvo.dataset.table import write_sets
     from gpvo.learning import store
     from gpvo.learning import train as learning
@@ -197,7 +191,7 @@ def _train(
         if len(paths) > 1 or update is not None:
             raise GpvoError("a file of training rows must be given alone", where=paths[0], cure="or give run folders")
         return store.train_stored(paths[0], config, on_fit=on_fit)
-    runs = _rows(paths, config, noisy)
+    runs = _rows(paths, config)
     if config.target == "position":
         return learning.train_position(list(runs), config)
     if update is not None:

@@ -16,7 +16,9 @@ def score(
     truth: Annotated[
         list[Path] | None, "TUM poses of the same camera, in the same order.", {"metavar": "<path>"}
     ] = None,
-    truth_sigma: Annotated[str | None, "Noise of the truth per pose: metres[,radians]; none by default."] = None,
+    truth_sigma: Annotated[
+        str | None, "Noise of the truth per pose: metres[,radians[,seconds of jitter]]; none by default."
+    ] = None,
     out: Annotated[Path | None, "With a folder of methods: write METHOD.json and board.csv here."] = None,
     json_: Json = False,
 ) -> None:

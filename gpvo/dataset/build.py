@@ -16,6 +16,8 @@ from gpvo.dataset.clock import estimate_time_offset, on_clock_of_log
 from gpvo.dataset.doubtful import false_motions, in_waits, odd_stretches
 from gpvo.dataset.errors import motion_targets, position_targets, require_attitude
 from gpvo.dataset.hand_eye import align_frames, windowed_motions
+from gpvo.dataset.noiseless import without_noise
+from gpvo.dataset.truth_noise import TruthNoise, of_stamps
 from gpvo.errors import NO_TRUTH, GpvoError
 from gpvo.io.run_read import Run, read_run
 from gpvo.online.base import RESIDUAL_COLUMN, positions
@@ -42,7 +44,9 @@ class TrainingSet:
     plausibility alone, also in ``lost``), frames without truth, those whose truth moves at rest or jumps, and those in
     odd stretches. ``lost_xi`` (m, 6): errors of the slips that have truth; ``lost_jump`` (m, 6): their distance from
     the motion expected.
-    ``odometry``: settings of gpvo's own odometry, empty if another one made the log.
+    ``odometry``: settings of gpvo's own odometry, empty if another one made the log. Where the truth is noisy, ``Y`` is
+    without its noise (:mod:`gpvo.dataset.noiseless`); ``told`` (n, 6) are the errors by the truth as it is, by which a
+    model is judged, and ``truth_noise`` (n, 6, 6) is the covariance of what it adds to them. Else both are None.
     """
 
     name: str
@@ -59,6 +63,8 @@ class TrainingSet:
     lost_xi: Array = field(default_factory=lambda: np.zeros((0, 6)))
     lost_jump: Array = field(default_factory=lambda: np.zeros((0, 6)))
     odometry: Mapping[str, Any] = field(default_factory=dict)
+    told: Array | None = None
+    truth_noise: Array | None = None
 
     def __len__(self) -> int:
         return len(self.X)
@@ -75,6 +81,9 @@ class TrainingSet:
     def over(cls, sets: Sequence[TrainingSet], made: Callable[[list[NDArray[Any]]], NDArray[Any]]) -> TrainingSet:
         """The first set with other rows: each array of a row per motion is ``made`` of those of all the sets, alike."""
         changed: dict[str, Any] = {n: made([getattr(s, n) for s in sets]) for n in ("X", "Y", "t_ns", "dt_s")}
+        for name in ("told", "truth_noise"):
+            if getattr(sets[0], name) is not None:
+                changed[name] = made([getattr(s, name) for s in sets])
         for name in ("covariances", "v_t"):
             changed[name] = {m: made([getattr(s, name)[m] for s in sets]) for m in getattr(sets[0], name)}
         return replace(sets[0], **changed)
@@ -87,7 +96,9 @@ class TrainingSet:
     def digest(self) -> str:
         """SHA-256 of the rows."""
         sha = hashlib.sha256(repr((self.name, self.columns, self.target, self.X.shape)).encode())
-        for array in (self.X, self.Y, self.t_ns, self.dt_s, *(self.covariances[m] for m in sorted(self.covariances))):
+        stated = (self.covariances[m] for m in sorted(self.covariances))
+        told = [a for a in (self.told, self.truth_noise) if a is not None]
+        for array in (self.X, self.Y, self.t_ns, self.dt_s, *stated, *told):
             sha.update(np.ascontiguousarray(array).tobytes())
         return sha.hexdigest()
 
@@ -114,6 +125,7 @@ def build(
     target: str = "frame",
     waits: str = "drop",
     odd: str = "keep",
+    exact: bool = False,
     where: object = None,
 ) -> TrainingSet:
     """The training set of one run. Frames that are lost or lack truth are left out and counted.
@@ -121,8 +133,8 @@ def build(
     ``columns``: by default all of ``full`` and the residual. ``waits``: "drop" leaves out, and counts, what falls into
     waits in which the truth moves, or its jumps (:func:`gpvo.dataset.doubtful.false_motions`); "keep" learns from
     them. ``odd``: the same of stretches in which odometry and truth differ far more than elsewhere
-    (:func:`gpvo.dataset.doubtful.odd_stretches`). Raises GpvoError where nothing is left to learn from, which names
-    ``where``, by default ``name``.
+    (:func:`gpvo.dataset.doubtful.odd_stretches`). ``exact``: the truth is simulated. Raises GpvoError where nothing is
+    left to learn from, which names ``where``, by default ``name``.
     """
     Window.of(target)  # refuses an unknown one before any work
     for what, way in (("waits", waits), ("odd stretches", odd)):
@@ -135,11 +147,13 @@ def build(
         require_attitude(log, truth, where or name)
         _require_one_unit(log, truth, where or name)
     records, X = observe(log, names, target)
-    seen = VoLog(records)
+    seen, noise = VoLog(records), TruthNoise()
     if target == "position":
-        Y, known = position_targets(log, seen.usable, truth)
+        Y, known = told, _ = position_targets(log, seen.usable, truth)
     else:
-        Y, known = motion_targets(records, truth)
+        drawn, noise = (truth, noise) if exact else without_noise(log, truth)
+        (Y, known), (told, has) = (motion_targets(records, t) for t in (drawn, truth))
+        known &= has
     with_truth = int(known.sum())
     if waits == "drop":
         known &= ~in_waits(seen, false_motions(log, truth))
@@ -178,6 +192,8 @@ def build(
         target=target,
         lost_xi=as_if[has],
         lost_jump=jumps[has],
+        told=told[known] if noise else None,
+        truth_noise=of_stamps(noise, log, truth, kept.column("t_prev_ns"), kept.t_ns) if noise else None,
     )
 
 
@@ -218,7 +234,7 @@ def build_run(
     """The training set of a run or its folder. ``align``, ``time_offset_s``: see :func:`aligned`; ``how``: further
     arguments of :func:`build`, as ``columns``, ``target``, ``waits`` and ``odd``."""
     run = aligned(read_run(run), align, time_offset_s)[0]
-    rows = build(run.log, run.truth, name=run.name, where=run.path, **how)
+    rows = build(run.log, run.truth, name=run.name, exact=bool(run.meta.get("twin")), where=run.path, **how)
     return replace(rows, odometry=that_matter(run.settings))
 
 

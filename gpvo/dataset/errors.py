@@ -1,12 +1,11 @@
 """Ground truth beside a log, and what the model learns from it: the error of each motion, of a window of motions, or
-the residual of a position; and the noise of the truth itself.
+the residual of a position.
 """
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from math import comb
 
 import numpy as np
 from numpy.typing import NDArray
@@ -14,27 +13,12 @@ from numpy.typing import NDArray
 from gpvo.errors import GpvoError
 from gpvo.geometry import se3
 from gpvo.stats.consistency import rms
-from gpvo.stats.series import block_bootstrap, integral, interpolated, moving_sums
 from gpvo.types import Array, TruthLog, VoLog, VoRecord
 
 MAX_GAP_S = 0.5
 _GAP_STEPS = 3.0
 """Usual steps, of truth or frames, that the truth is interpolated over, if at most ``MAX_GAP_S``: a pose must be
 exact enough to judge a motion by, which the filter's guesses over a gap of the IMU need not (``filters.plausible``)."""
-# Of the truth's noise:
-_ORDER = 3
-"""Differences of the poses. Vehicles have little of a third one at 10 Hz, where white noise has the most."""
-_MIN_ROWS = 60
-_MIN_SHARE = 0.25
-"""Share of the truth's high-passed motion that the odometry must lack: an error of its scale lacks a few hundredths."""
-_MAX_LAG1 = -0.4
-"""White noise has a correlation of -0.75 there; what an odometry smooths away of a real motion has less."""
-_EVEN_DT = 0.2
-_OUTLIER = 6.0
-_SAME = 3e-4
-"""Of the motion: what odometry and truth differ by from one motion to the next if one was made from the other. Graphs
-that close loops leave 1e-5 (on the road, with four decimals, 1e-4); cameras and truths of their own over 5e-3."""
-_MIN_WINDOWS = 10
 _NO_TURN_DEG, _TURN_DEG, _STRAIGHT = 1e-3, 5.0, 0.05  # the last: of a path's extent, what it has across
 _LEAPS, _MOVING = 1.5, 0.25
 
@@ -109,7 +93,6 @@ def steps_of_slow_truth(truth: TruthLog, t_ns: NDArray[np.int64]) -> tuple[float
 
 
 _STRAIGHT_M, _FEWEST_KNOTS = 5e-6, 5
-_TOGETHER = 4  # windows of a second whose drifts may be alike
 
 
 def interpolated_between(truth: TruthLog) -> int | None:
@@ -159,6 +142,10 @@ class MotionErrors:
     def sizes(self) -> Array:
         """(M, 2) of translation [m] and rotation [rad]."""
         return np.linalg.norm(self.xi.reshape(-1, 2, 3), axis=2)
+
+    def rows(self, keep: NDArray) -> MotionErrors:
+        """Some of them."""
+        return MotionErrors(self.index[keep], self.xi[keep], self.T_true[keep], self.T_est[keep], self.dt_s[keep])
 
     def far(self, medians: float) -> NDArray[np.bool_]:
         """(M,) whether translation or rotation is wrong by more than so many times its median error."""
@@ -234,112 +221,3 @@ def position_targets(log: VoLog, usable: NDArray[np.bool_], truth: TruthLog) -> 
     residual = trajectory[:, :3, 3] - (T_first_world @ T_true)[:, :3, 3]
     known = has & usable
     return np.where(known[:, None], residual, np.nan), known
-
-
-def estimate_truth_noise(errors: MotionErrors, log: VoLog) -> Array:
-    """(6,) standard deviation [m, rad] of the truth's white noise per pose, by axis of the camera; 0 where none shows.
-
-    Jitter of stamps, GPS/INS and motion capture put noise n_k on each pose, so that a true motion m_k is reported
-    as ``u_k = m_k + n_k - n_(k-1)``. Odometry reports ``m_k`` with errors of its own. High-passed until little is left
-    of m_k, what the truth has and the odometry lacks is the truth's noise: ``Cov(u, u - odometry)`` gives its variance,
-    whatever noise, jitter included, the odometry itself has (two instruments for one quantity: F. E. Grubbs, "On
-    estimating precision of measuring instruments and product variability", 1948). An axis counts where the 95 %
-    interval of its variance, by blocks of time, lies above zero.
-    """
-    told, lacks, first = _high_passed(errors, log)
-    if len(told) < _MIN_ROWS:
-        return np.zeros(6)
-    products = told * lacks / comb(2 * _ORDER, _ORDER)
-    usual = 1.4826 * np.median(np.abs(lacks), axis=0)
-    sigma = np.zeros(6)
-    for axis in range(6):
-        good = np.abs(lacks[:, axis]) <= _OUTLIER * usual[axis]  # a slip of the odometry is no noise of the truth
-        variance = block_bootstrap(products[good, axis])
-        pairs = good[:-1] & good[1:] & (np.diff(first) == 1)
-        u, d = told[:, axis], lacks[:, axis]
-        neighbours = 0.5 * np.mean(u[:-1][pairs] * d[1:][pairs] + u[1:][pairs] * d[:-1][pairs])
-        power = comb(2 * _ORDER, _ORDER) * variance.mean
-        if variance.low > 0 and power > _MIN_SHARE * np.mean(u[good] ** 2) and neighbours < _MAX_LAG1 * power:
-            sigma[axis] = np.sqrt(variance.mean)
-    return sigma
-
-
-def made_from_odometry(errors: MotionErrors, log: VoLog) -> bool:
-    """Whether the truth seems to be the odometry's own path, as closing loops bends it.
-
-    That spreads a drift evenly over the motions, so that the errors show it, but none of the odometry's noise: from one
-    motion to the next, the two agree better than any two measurements do.
-    """
-    lacks = _high_passed(errors, log)[1][:, :3]
-    if len(lacks) < _MIN_ROWS:
-        return False
-    differ = np.median(np.linalg.norm(lacks, axis=1)) / np.sqrt(comb(2 * (_ORDER - 1), _ORDER - 1))
-    return bool(differ < _SAME * np.median(np.linalg.norm(errors.T_true[:, :3, 3], axis=1)))
-
-
-def _high_passed(errors: MotionErrors, log: VoLog) -> tuple[Array, Array, NDArray[np.int64]]:
-    """Second differences (n, 6) of the truth's motions and of what odometry lacks of them, and their first rows (n,),
-    over motions from the frame before of one length in time."""
-    steps = _ORDER - 1
-    if len(errors.index) <= steps:
-        return np.zeros((0, 6)), np.zeros((0, 6)), np.zeros(0, dtype=np.int64)
-    told, lacks = (np.diff(x, n=steps, axis=0) for x in (se3.log(errors.T_true), -errors.xi))
-    usual = np.median(errors.dt_s)
-    even = (np.abs(errors.dt_s - usual) <= _EVEN_DT * usual) & (log.parent[errors.index] == errors.index - 1)
-    whole = moving_sums(even, steps + 1) == steps + 1
-    whole &= errors.index[steps:] - errors.index[: len(errors.index) - steps] == steps
-    rows = np.flatnonzero(whole).astype(np.int64)
-    return told[rows], lacks[rows], rows
-
-
-def telling_distance_m(log: VoLog, T_true: Array, known: NDArray[np.bool_], sigma: Array) -> float:
-    """Length of path [m] from which odometry's errors of position outweigh the truth's noise ``sigma`` (6,).
-
-    0 where each single motion tells, inf where no stretch of the run does. ``T_true`` (N, 4, 4), ``known`` (N,).
-    """
-    if not sigma.any():
-        return 0.0
-    T_est, whole = log.trajectory(), known & (log.usable | (np.arange(len(log)) == 0))
-    broken, path_m = np.cumsum(~whole), se3.path_length_m(T_true[:, :3, 3])
-    span = 1
-    while span < len(log) - _MIN_WINDOWS:
-        start = np.flatnonzero(broken[span:] == broken[:-span])
-        start = start[whole[start]]
-        if len(start) < _MIN_WINDOWS:
-            break
-        true, said = (se3.inverse(T[start]) @ T[start + span] for T in (T_true, T_est))
-        error = (se3.inverse(true) @ said)[:, :3, 3]
-        # Both errors, of odometry and of two poses of truth, are in there; a slip shall not speak for all.
-        if np.median((error**2).sum(axis=1)) > 2 * 2 * (sigma[:3] ** 2).sum():
-            return 0.0 if span == 1 else float(np.median(path_m[start + span] - path_m[start]))
-        span *= 2
-    return float("inf")
-
-
-def outweighed_by_truth(log: VoLog, truth: TruthLog) -> bool:
-    """Whether the truth's noise, estimated, outweighs the odometry's errors of single motions."""
-    sigma = estimate_truth_noise(motion_errors(log, truth), log)
-    return telling_distance_m(log, *interpolate_truth(truth, log.t_ns), sigma) > 0.0
-
-
-def velocity_path(truth: TruthLog, t_ns: NDArray[np.int64]) -> Array | None:
-    """(N, 3) where the truth's own velocities lead until the stamps (N,) [m, world]; None where it has none."""
-    if truth.v_world_mps is None:
-        return None
-    t_s = (truth.t_ns - truth.t_ns[0]) * 1e-9
-    at_s = (np.asarray(t_ns) - truth.t_ns[0]) * 1e-9
-    return interpolated(at_s, t_s, integral(truth.v_world_mps, t_s))
-
-
-def drift_variance(contradiction: Array, error: Array) -> Array:
-    """(3,) variance of the truth's displacements over windows (W, 3) [m^2]; 0 where the 95 % interval holds zero.
-
-    GPS/INS positions drift, by decimetres within seconds, where satellites are hidden. High-passing cannot show this,
-    but a third instrument can: a truth that also measures velocities gives each displacement twice, and where the two
-    differ, one is wrong. ``Cov(positions - velocities, positions - odometry)`` is the variance of the positions.
-
-    ``contradiction``: displacements by the truth's positions less those by its velocities; ``error``: those by odometry
-    less those by the positions; both in axes of the camera.
-    """
-    found = [block_bootstrap(product, _TOGETHER) for product in -(contradiction * error).T]
-    return np.array([v.mean if v.low > 0 else 0.0 for v in found])

@@ -18,11 +18,12 @@ from numpy.typing import NDArray
 from gpvo.dataset.build import TrainingSet
 from gpvo.errors import CalibrationError, SourceError
 from gpvo.files import parse_json, replacing
-from gpvo.geometry.covariance import LARGEST, from_upper, upper
+from gpvo.geometry.covariance import LARGEST, are_semidefinite, from_upper, upper
 from gpvo.io.parquet import numbers_of
 from gpvo.types import Array, StereoCamera
 
 SCHEMA = 1
+_OF_TRUTH = "truth"
 _STATED = ("name", "target", "counts", "camera", "odometry", "columns", "lost_xi", "lost_jump")  # beside the rows
 
 
@@ -59,7 +60,10 @@ def _table(i: int, s: TrainingSet) -> pa.Table:
     columns: dict[str, Any] = {"sequence": np.full(len(s), i, dtype=np.int64), "t_ns": s.t_ns, "dt_s": s.dt_s}
     columns |= {f"x.{name}": s.X[:, k] for k, name in enumerate(s.columns)}
     columns |= {f"y.{k}": s.Y[:, k] for k in range(s.Y.shape[1])}
-    for kind, matrices in (("cov", s.covariances), ("vt", s.v_t)):
+    if s.told is not None:
+        columns |= {f"told.{k}": s.told[:, k] for k in range(s.told.shape[1])}
+    noise = {} if s.truth_noise is None else {_OF_TRUTH: s.truth_noise}
+    for kind, matrices in (("cov", s.covariances), ("vt", s.v_t), ("noise", noise)):
         for method, C in matrices.items():
             columns |= zip(_elements(kind, method, C.shape[-1]), upper(C).T, strict=True)
     return pa.table({k: _array(np.ascontiguousarray(v)) for k, v in columns.items()})
@@ -95,7 +99,12 @@ def _require_sound(s: TrainingSet) -> None:
         raise ValueError(f"the counts of '{s.name}' are none")
     if s.t_ns.dtype != np.int64 or (s.t_ns[1:] < s.t_ns[:-1]).any() or not (s.dt_s > 0).all():
         raise ValueError(f"the stamps of '{s.name}' do not increase")
-    errors = (s.Y, s.lost_xi, s.lost_jump, s.dt_s)
+    told = [] if s.told is None else [s.told]
+    if (s.told is None) != (s.truth_noise is None):
+        raise ValueError(f"'{s.name}' holds half of what a noisy truth tells")
+    if s.truth_noise is not None and not are_semidefinite(s.truth_noise).all():
+        raise ValueError(f"the noise of the truth of '{s.name}' is none")
+    errors = (s.Y, s.lost_xi, s.lost_jump, s.dt_s, *told)
     if s.Y.shape[1] not in (3, 6) or not all((np.abs(e) < LARGEST).all() for e in errors) or np.isinf(s.X).any():
         raise ValueError(f"'{s.name}' holds numbers that are no errors or features")
 
@@ -115,12 +124,19 @@ def _set_of_table(entry: dict[str, Any], table: pa.Table) -> TrainingSet:
             if table[names[0]].null_count < table.num_rows
         }
 
-    outputs = sum(name.startswith("y.") for name in table.column_names)
+    def errors(kind: str) -> Array | None:
+        names = [n for n in (f"{kind}.{k}" for k in range(6)) if n in table.column_names]
+        known = names and table[names[0]].null_count < table.num_rows
+        return np.stack([column(n) for n in names], axis=1) if known else None
+
+    Y = errors("y")
+    if Y is None:
+        raise ValueError(f"'{entry['name']}' holds no errors")
     made = TrainingSet(
         name=entry["name"],
         columns=tuple(entry["columns"]),
         X=np.stack([column(f"x.{c}").astype(np.float64) for c in entry["columns"]], axis=1),
-        Y=np.stack([column(f"y.{k}") for k in range(outputs)], axis=1),
+        Y=Y,
         t_ns=column("t_ns"),
         dt_s=column("dt_s"),
         covariances=matrices("cov", 6),
@@ -131,6 +147,8 @@ def _set_of_table(entry: dict[str, Any], table: pa.Table) -> TrainingSet:
         lost_xi=np.array(entry.get("lost_xi", []), dtype=np.float64).reshape(-1, 6),
         odometry=dict(entry.get("odometry", {})),
         lost_jump=np.array(entry.get("lost_jump", []), dtype=np.float64).reshape(-1, 6),
+        told=errors("told"),
+        truth_noise=matrices("noise", 6).get(_OF_TRUTH),
     )
     _require_sound(made)
     return made

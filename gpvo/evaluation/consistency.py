@@ -10,10 +10,11 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from gpvo.accumulation import PoseError, carry, over_windows
-from gpvo.dataset.errors import MotionErrors, drift_variance
+from gpvo.dataset.errors import MotionErrors
+from gpvo.dataset.truth_noise import drift_variance, of_motions
 from gpvo.evaluation.statements import Statement
 from gpvo.geometry import se3
-from gpvo.geometry.covariance import compound, variances
+from gpvo.geometry.covariance import variances
 from gpvo.learning.methods import score
 from gpvo.stats.consistency import (
     BLOCKS,
@@ -38,10 +39,9 @@ _SCORED = ("nees_dof_median", "coverage", "nll_per_dim", "nll_stated_per_dim", "
 HORIZONS_M = (1.0, 10.0, 100.0)
 TOO_FAR = 2.5
 """Times a span: where frames are sparser than it, or missing, what lies between two of them is not called by it."""
-_MAX_WINDOWS, _AT_ONCE = 60, 1000
+_MAX_WINDOWS = 60
 # Times that are sums of a frame period must not miss the round number.
 _HAIR = 1 - 1e-9
-_NOISELESS = np.zeros(6)
 
 
 @dataclass(frozen=True)
@@ -98,22 +98,13 @@ class Consistency:
     horizons: tuple[Horizon, ...] = ()
 
 
-def truth_noise(T_true: Array, sigma: Array) -> Array:
-    """(M, 6, 6) covariance that the truth's own noise, ``sigma`` (6,) per pose, adds to errors of motions (M, 4, 4).
-
-    Each motion holds the noise of two poses: ``S + Ad(T)^-1 S Ad(T)^-T``, the MA(1) shape of a differenced position.
-    """
-    S = np.diag(np.asarray(sigma) ** 2)
-    return compound(T_true, S, S)
-
-
 def consistency(
     statement: Statement, errors: MotionErrors, log: VoLog, T_true: Array, known: NDArray[np.bool_],
-    noise_sigma: Array = _NOISELESS, by_velocity: Array | None = None,
+    noise: Array | None = None, by_velocity: Array | None = None,
 ) -> Consistency | None:  # fmt: skip
     """Scores of one method, None where it says nothing about any motion with truth.
 
-    ``T_true`` (N, 4, 4) and ``known`` (N,): truth at the log's stamps. ``noise_sigma`` (6,): of its poses [m, rad].
+    ``T_true`` (N, 4, 4) and ``known`` (N,): truth at the log's stamps. ``noise`` (N, 6, 6): covariance of these.
     ``by_velocity`` (N, 3): where the truth's own velocities lead (:func:`gpvo.dataset.errors.velocity_path`).
     """
     C = statement.covariance[errors.index]
@@ -122,13 +113,12 @@ def consistency(
         return None
     index, d = errors.index[stated], statement.dof
     axes = counted_axes(seen_axes(errors.xi), d)
-    T_stated = errors.T_true[stated]
     e, C = (errors.xi[stated] - statement.mean[index])[:, :d], C[stated]
-    per_block, with_noise = nees_by_block(e, C, axes), dict[str, list[float]]()
-    for rows in np.array_split(np.arange(len(e)), len(e) // _AT_ONCE + 1):
-        noise = truth_noise(T_stated[rows], noise_sigma)[:, :d, :d]
-        for name, values in nees_by_block(e[rows], C[rows] + noise, axes).items():
-            with_noise.setdefault(name, []).extend(values.tolist())
+    per_block = nees_by_block(e, C, axes)
+    if noise is not None:
+        # From here on, errors are those of odometry and of the truth.
+        C = C + of_motions(errors.T_true[stated], noise[_starts(index, log)], noise[index])[:, :d, :d]
+    with_noise = nees_by_block(e, C, axes)
     scores = score(errors.xi[stated], statement.mean[index], C, statement.nu, axes)
     energy = {unit: _energy(e, C, axes[np.isin(axes, BLOCKS[block])]) for unit, block in UNITS.items()}
     e, C = e[:, axes], marginal(C, axes)
@@ -137,7 +127,7 @@ def consistency(
     progress = se3.path_length_m(T_true[:, :3, 3]), (log.t_ns - log.t_ns[0]) * 1e-9
 
     def over(along: Array, span: float) -> Horizon:
-        return horizon(statement, log, T_true, known, along, span, noise_sigma, by_velocity, axes)
+        return horizon(statement, log, T_true, known, along, span, noise, by_velocity, axes)
 
     return Consistency(
         method=statement.method,
@@ -154,6 +144,12 @@ def consistency(
         one_second=over(progress[1], 1.0) if d == 6 else None,
         horizons=tuple(over(progress[0], m) for m in HORIZONS_M if d == 6),
     )
+
+
+def _starts(index: NDArray[np.int64], log: VoLog) -> NDArray[np.int64]:
+    """(M,) frames where motions ``index`` (M,) start; where the log does not hold one, that where it ends."""
+    parent = log.parent[index]
+    return np.where(parent < 0, index, parent)
 
 
 def _energy(error: Array, covariance: Array, axes: NDArray[np.intp]) -> float | None:
@@ -189,7 +185,7 @@ def _ancestors(frame: int, root: int, parent: NDArray[np.int64]) -> list[int]:
 
 def horizon(
     statement: Statement, log: VoLog, T_true: Array, known: NDArray[np.bool_], progress: Array, span: float,
-    noise_sigma: Array, by_velocity: Array | None, axes: ArrayLike,
+    noise: Array | None, by_velocity: Array | None, axes: ArrayLike,
 ) -> Horizon:  # fmt: skip
     """NEES over windows of ``span`` of a growing ``progress`` (N,), at most sixty, without lost frames.
 
@@ -205,15 +201,16 @@ def horizon(
     motion = log.T_prev_cur @ se3.exp(-statement.mean)
     T_est = np.array([reduce(np.matmul, motion[chain], np.eye(4)) for chain in chains])
     C = over_windows(log.T_prev_cur, statement.errors, chains)
-    e, noise, drift = se3.log(se3.inverse(T) @ T_est), truth_noise(T, noise_sigma), np.zeros(3)
+    e, drift = se3.log(se3.inverse(T) @ T_est), np.zeros(3)
+    own = np.zeros_like(C) if noise is None else of_motions(T, noise[starts], noise[ends])
     if by_velocity is not None:
         moved = T_true[ends, :3, 3] - T_true[starts, :3, 3] - (by_velocity[ends] - by_velocity[starts])
         drift = drift_variance(np.einsum("nji,nj->ni", T_true[ends, :3, :3], moved), e[:, :3])
         # The white noise of two poses is in the variance of a displacement, too.
-        noise[:, range(3), range(3)] = np.maximum(noise[:, range(3), range(3)], drift)
-    z2 = (e**2 / variances(C + noise)).mean(axis=0)
-    plain, noisy = (float(nees_by_block(e, S, axes)["joint"].mean()) for S in (C, C + noise))
-    worth = _independent(statement.errors, log, chains, C, C + noise, np.asarray(axes))
+        own[:, range(3), range(3)] = np.maximum(own[:, range(3), range(3)], drift)
+    z2 = (e**2 / variances(C + own)).mean(axis=0)
+    plain, noisy = (float(nees_by_block(e, S, axes)["joint"].mean()) for S in (C, C + own))
+    worth = _independent(statement.errors, log, chains, C, C + own, np.asarray(axes))
     return Horizon(span, plain, noisy, tuple(z2.tolist()), tuple(np.sqrt(drift).tolist()), len(chains), worth)
 
 

@@ -114,6 +114,7 @@ def run_document(e: Evaluation) -> dict[str, Any]:
         "truth_sigma": _by_kind(e.truth_sigma),
         "truth_sigma_axes": e.truth_sigma.tolist(),
         "truth_sigma_stated": _by_kind(e.truth_sigma_stated),
+        "truth_jitter_s": e.truth_jitter_s,
         "truth_tells_from_m": e.tells_from_m,
         **{n: None if found is None else asdict(found) for n, found in suspected.items()},
         "rpe": {"frame": asdict(t.rpe_frame), "1s": asdict(t.rpe_second), "10m": asdict(t.rpe_10m)},

@@ -18,15 +18,13 @@ from gpvo.dataset.doubtful import Stretch, jumps, odd_stretches, without_wanderi
 from gpvo.dataset.errors import (
     MAX_GAP_S,
     MotionErrors,
-    estimate_truth_noise,
     interpolate_truth,
     interpolation_sigma,
     motion_errors,
-    telling_distance_m,
     turn_without_truth_deg,
-    velocity_path,
 )
 from gpvo.dataset.misread import FixedRotation, InversePoses, Misread, Resemblance, late_by
+from gpvo.dataset.truth_noise import TruthNoise, estimate_truth_noise, rates_of, telling_distance_m, velocity_path
 from gpvo.errors import NO_TRUTH, SourceError
 from gpvo.evaluation.consistency import BY_MODEL, Consistency, consistency
 from gpvo.evaluation.statements import Statement, statements
@@ -44,11 +42,11 @@ from gpvo.types import Array, Prediction, Status, TruthLog, VoLog
 
 @dataclass(frozen=True)
 class EvaluateOptions:
-    """``truth_sigma`` (m, rad) per pose, None for what the source states or the run shows, whichever is more;
-    ``time_offset_s`` None to estimate it."""
+    """``truth_sigma`` (m, rad) per pose, or (m, rad, s) with jitter of stamps; None for what the source states or the
+    run shows, whichever is more. ``time_offset_s`` None to estimate it."""
 
     segments_m: tuple[float, ...] | None = None
-    truth_sigma: tuple[float, float] | None = None
+    truth_sigma: tuple[float, ...] | None = None
     align: str = "none"
     time_offset_s: float | None = 0.0
 
@@ -58,13 +56,14 @@ class Evaluation:
     """Everything said of one run. ``covered``: frames with truth; ``T_est`` and ``T_true`` (N, 4, 4) with the first
     poses made equal. ``unscored``: motions left out of errors and consistency, as the truth moves while the vehicle
     stands, or jumps. ``odd``: these jumps, and stretches in which odometry and truth differ far more than elsewhere.
-    ``truth_sigma`` (6,): noise of the truth's poses by axis, as counted in; ``truth_sigma_stated`` (6,): as its source
-    states. ``tells_from_m``: length of path from which odometry's errors outweigh it. ``late_s``: offset between the
-    clocks, where it matters and none was given; ``turned``: a fixed rotation between truth and odometry, likewise;
-    ``inverse``: poses of one of the two seem to be inverse; ``unlike``: how little the two resemble each other, where
-    they do not. ``in_domain``: share of the predicted frames that lie in the model's training domain, None without a
-    model. ``misfits``: why else the model does not fit the run, or cannot be judged by it. ``poses``: scores of the
-    covariances of poses that a log states.
+    ``truth_sigma`` (6,): noise of the truth's poses by axis, as counted in, root mean square over the run;
+    ``truth_sigma_stated`` (6,): as its source states; ``truth_jitter_s``: jitter of its stamps, of which the former
+    holds what it makes of the poses. ``tells_from_m``: length of path from which odometry's errors outweigh it.
+    ``late_s``: offset between the clocks, where it matters and none was given; ``turned``: a fixed rotation between
+    truth and odometry, likewise; ``inverse``: poses of one of the two seem to be inverse; ``unlike``: how little the
+    two resemble each other, where they do not. ``in_domain``: share of the predicted frames that lie in the model's
+    training domain, None without a model. ``misfits``: why else the model does not fit the run, or cannot be judged by
+    it. ``poses``: scores of the covariances of poses that a log states.
     """
 
     run: Run
@@ -77,6 +76,7 @@ class Evaluation:
     T_true: Array
     truth_sigma: Array = field(default_factory=lambda: np.zeros(6))
     truth_sigma_stated: Array = field(default_factory=lambda: np.zeros(6))
+    truth_jitter_s: float = 0.0
     time_offset_s: float = 0.0
     tells_from_m: float = 0.0
     turned: FixedRotation | None = None
@@ -148,11 +148,14 @@ def evaluate_run(
     unseen = (r.with_status(Status.LOST, "truth has no attitude") for r in log)  # positions alone judge no motion
     scored = log.judged_as(unseen) if blind else without_wandering_truth(log, truth, leaps)
     errors = motion_errors(scored, truth)
-    stated = np.repeat(options.truth_sigma or (truth.sigma_translation_m, truth.sigma_rotation_rad), 3)
-    sigma = stated
+    given = options.truth_sigma or (truth.sigma_translation_m, truth.sigma_rotation_rad)
+    stated = np.repeat(given[:2], 3)
+    noise, rates = TruthNoise(stated, sum(given[2:])), rates_of(T_true, log.t_ns, known)
     if options.truth_sigma is None:
-        shown = estimate_truth_noise(errors, scored), interpolation_sigma(truth, log.t_ns)
-        sigma = np.maximum.reduce([stated, *shown])
+        shown = estimate_truth_noise(errors, scored)
+        least = np.maximum(stated, interpolation_sigma(truth, log.t_ns))
+        noise = replace(shown, sigma=np.maximum(shown.sigma, least))
+    sigma = noise.usual(rates[known])
     late_s = late_by(scored, truth) if options.time_offset_s == 0.0 else None
     on_its_clock = on_clock_of_log(truth, late_s) if late_s else truth
     misread = Misread.of(scored, on_its_clock)
@@ -160,7 +163,13 @@ def evaluate_run(
     made = statements(log, predictions, predictor, further)
     by_velocity = velocity_path(truth, log.t_ns) if options.truth_sigma is None else None
     judge = partial(
-        consistency, errors=errors, log=scored, T_true=T_true, known=known, noise_sigma=sigma, by_velocity=by_velocity
+        consistency,
+        errors=errors,
+        log=scored,
+        T_true=T_true,
+        known=known,
+        noise=noise.of_poses(rates) if sigma.any() else None,
+        by_velocity=by_velocity,
     )
     found = list(map(judge, made))  # each statement is let go before the next
     first = int(np.flatnonzero(known)[0])
@@ -181,6 +190,7 @@ def evaluate_run(
         T_true=T_true,
         truth_sigma=sigma,
         truth_sigma_stated=stated,
+        truth_jitter_s=noise.jitter_s,
         tells_from_m=telling_distance_m(scored, T_true, known, sigma),
         turned=misread.turned if options.align == "none" else None,
         inverse=misread.inverse,

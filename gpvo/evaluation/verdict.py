@@ -13,12 +13,12 @@ from gpvo.dataset.check import ENOUGH_INSIDE
 from gpvo.dataset.errors import (
     MAX_GAP_S,
     interpolated_between,
-    made_from_odometry,
     steps_of_slow_truth,
     turn_without_truth_deg,
     without_held,
 )
 from gpvo.dataset.misread import GROSS_DEG, FixedRotation, Resemblance
+from gpvo.dataset.truth_noise import made_from_odometry
 from gpvo.evaluation.consistency import BY_MODEL, Consistency, Horizon
 from gpvo.online.features import AXES
 from gpvo.stats.consistency import seen_axes
@@ -233,9 +233,10 @@ def _conditions(e: Evaluation) -> Iterator[str]:
         )
     if (e.truth_sigma > 1.5 * e.truth_sigma_stated).any():
         stated = _up_to(e.truth_sigma_stated) or "none"
+        jitter = f", as its stamps jitter by {1e3 * e.truth_jitter_s:.2g} ms" if e.truth_jitter_s else ""
         yield (
             f"The truth itself has an estimated noise of {_up_to(e.truth_sigma)} per pose on its worst axis (its source"
-            f" states {stated}). This is taken into account."
+            f" states {stated}){jitter}. This is taken into account."
         )
     if not e.covered.any():
         yield "gpvo evaluate --twins judges a run by its twins, if it was made with --keep-tracks."

@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 import hashlib
+import math
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import asdict, dataclass, field, replace
-from functools import partial
 from importlib.metadata import version
 from itertools import count
 from pathlib import Path
@@ -188,8 +188,7 @@ def _fold(
     estimate, of_base = (estimate_set(model, held_out) for model in (learned.model, learned.base))
     stated["learned"] = (estimate.mean, estimate.covariance, estimate.nu)
     stated["base"] = (of_base.mean, of_base.covariance, of_base.nu)
-    of = partial(score, held_out.Y, axes=seen_axes(held_out.Y))
-    methods = {name: of(*stated[name]) if name in stated else empty() for name in METHODS}
+    methods = {name: _scored(held_out, *stated[name]) if name in stated else empty() for name in METHODS}
     return {
         "held_out": held_out.name,
         "rows": len(held_out),
@@ -202,6 +201,14 @@ def _fold(
         "slips": _slips(held_out, estimate, learned, arrays["method.constant"]),
         "choices": learned.choices,
     }
+
+
+def _scored(s: TrainingSet, mean: Array, covariance: Array, nu: float = math.inf) -> dict[str, Any]:
+    """Scores by the truth as it is told, its noise added to what is stated."""
+    if s.told is None or s.truth_noise is None:
+        return score(s.Y, mean, covariance, nu, seen_axes(s.Y))
+    d = covariance.shape[-1]
+    return score(s.told, mean, covariance + s.truth_noise[:, :d, :d], nu, seen_axes(s.told))
 
 
 def estimate_set(model: ErrorModel, s: TrainingSet) -> Prediction:

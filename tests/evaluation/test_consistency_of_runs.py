@@ -11,8 +11,9 @@ import numpy as np
 import pytest
 from evaluation_runs import make_run, stated_covariance
 from gpvo.dataset.errors import interpolate_truth, motion_errors
+from gpvo.dataset.truth_noise import of_motions
 from gpvo.evaluation import consistency as module
-from gpvo.evaluation.consistency import Consistency, consistency, horizon, truth_noise
+from gpvo.evaluation.consistency import Consistency, consistency, horizon
 from gpvo.evaluation.statements import Statement, predicted_statement, statements
 from gpvo.geometry import se3
 from gpvo.io.run import read_run, write_run
@@ -118,13 +119,14 @@ def test_predicted_final_error_is_that_of_drawn_runs():
 def test_truth_noise_is_that_of_two_noisy_poses():
     sigma_m, sigma_rad = 0.003, 0.001
     sigma = np.repeat([sigma_m, sigma_rad], 3)
-    np.testing.assert_allclose(truth_noise(np.eye(4)[None], sigma)[0], np.diag(2 * sigma**2))
+    of_pose = np.diag(sigma**2)[None]
+    np.testing.assert_allclose(of_motions(np.eye(4)[None], of_pose, of_pose)[0], np.diag(2 * sigma**2))
     T = se3.exp(np.array([0.5, -0.2, 1.0, 0.3, -0.4, 0.2]))
     rng = np.random.default_rng(0)
     noise = rng.standard_normal((2, 20_000, 6)) * ([sigma_m] * 3 + [sigma_rad] * 3)
     measured = se3.inverse(se3.exp(noise[0])) @ T @ se3.exp(noise[1])
     sample = np.cov(se3.log(se3.inverse(measured) @ T).T)
-    C = truth_noise(T[None], sigma)[0]
+    C = of_motions(T[None], of_pose, of_pose)[0]
     scale = np.sqrt(np.outer(np.diagonal(C), np.diagonal(C)))
     np.testing.assert_allclose(sample / scale, C / scale, atol=0.05)
 

@@ -70,3 +70,7 @@ def test_every_drive_of_tracks_runs_and_is_evaluated(real_data, tmp_path, drive)
     methods = document([e])["runs"][0]["methods"]
     for method in ("triangulation", "pointing_matching"):
         assert all(value is not None and value > 0 for value in methods[method]["nees_dof"].values())
+    # Cameras at 10 Hz are given the nearest of GPS/INS poses 10 ms apart: 2.9 ms, were that all. A drive at one speed
+    # cannot tell jitter from white noise.
+    jitter_s = 0.0 if drive.endswith("0095") else 0.0033
+    assert e.truth_jitter_s == pytest.approx(jitter_s, abs=0.0005)

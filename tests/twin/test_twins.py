@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 from gpvo.cameras.rig import TOLERANCES, Tolerance, TrueRig
 from gpvo.dataset.errors import motion_errors
+from gpvo.dataset.truth_noise import TruthNoise
 from gpvo.errors import GpvoError, SourceError
 from gpvo.evaluation.by_twins import ratios, twin_covariance
 from gpvo.io import open_source
@@ -308,7 +309,7 @@ def test_evaluate_by_twins_with_and_without_truth(flown, blind, monkeypatch):
     own = json.loads(gpvo("evaluate", flown[0] / "run", "--twins", "--replicates", 3, "--json").stdout)["runs"][0]
     assert 0.4 < own["methods"]["twin"]["nees_dof"]["joint"] < 2.5
     assert "simulated_truth" not in own
-    monkeypatch.setattr("gpvo.evaluation.evaluate.estimate_truth_noise", lambda *_: np.full(6, 1e-3))
+    monkeypatch.setattr("gpvo.evaluation.evaluate.estimate_truth_noise", lambda *_: TruthNoise(np.full(6, 1e-3)))
     by_twins = json.loads(gpvo("evaluate", blind, "--twins", "--replicates", 2, "--json").stdout)["runs"][0]
     assert by_twins["simulated_truth"]["twins"] == 2
     assert by_twins["verdict"] is None  # words have no mean
