@@ -11,7 +11,6 @@ from __future__ import annotations
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.linalg import cho_solve_banded, cholesky_banded, solve_banded
 
 from gpvo.dataset.errors import MotionErrors, interpolate_truth, motion_errors
 from gpvo.dataset.truth_noise import TruthNoise, estimate_truth_noise, rates_of
@@ -128,6 +127,8 @@ class _Chain:
 
     def _together(self, W: Array, rng: np.random.Generator) -> Array:
         """(k, 6) of the poses where motions start."""
+        from scipy.linalg import cho_solve_banded, cholesky_banded, solve_banded  # of training, as nothing before it
+
         k, inner = len(self._inner), ~self._last
         back = np.swapaxes(self._carry, 1, 2) @ W
         own, push = self._prior[self._inner], np.zeros((k, _D))

@@ -12,7 +12,6 @@ from math import comb
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.optimize import nnls
 
 from gpvo.dataset.errors import MotionErrors, interpolate_truth
 from gpvo.geometry import se3
@@ -125,6 +124,19 @@ def _shows(told: Array, lacks: Array, good: NDArray[np.bool_], follow: NDArray[n
     return bool(enough and neighbours < _MAX_LAG1 * variance.mean)
 
 
+def _non_negative(A: Array, y: Array) -> Array:
+    """(k,) least squares of (n, k) for (n,), without what would be negative; 0 for a column of zeros."""
+    size, theta = np.linalg.norm(A, axis=0), np.zeros(A.shape[1])
+    free = size > 0
+    while free.any():
+        found = np.linalg.lstsq(A[:, free] / size[free], y, rcond=None)[0] / size[free]
+        if (found >= 0).all():
+            theta[free] = found
+            break
+        free[np.flatnonzero(free)[found < 0]] = False
+    return theta
+
+
 def _jitter_variance(told: Array, lacks: Array, way2: Array, good: NDArray[np.bool_]) -> float:
     """Variance of the stamps [s^2] from k axes (n, k): what of the variance goes with the squared velocities ``way2``,
     beside a constant of each axis; 0 if the 95 % interval holds it.
@@ -143,8 +155,7 @@ def _jitter_variance(told: Array, lacks: Array, way2: Array, good: NDArray[np.bo
         spread = np.sqrt((both + own[0]) * (both + own[1]) + both**2) / _GAIN
         spread = np.maximum(spread, _LEAST_SPREAD * spread.mean(axis=0))
         A, y = (X / spread[:, :, None]).reshape(n * k, k + 1), (product / spread).ravel()
-        size = np.maximum(np.linalg.norm(A, axis=0), 1e-300)
-        theta = nnls(A / size, y)[0] / size
+        theta = _non_negative(A, y)
         stated = theta[0] * way2 + theta[1:]
     free = theta > 0
     if not free[0]:

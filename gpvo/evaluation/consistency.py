@@ -67,10 +67,10 @@ class Horizon:
 class Consistency:
     """Of one method on one run; None where it cannot be computed, and of a method that says nothing.
 
-    ``nees_dof`` by block of the error, with a block-bootstrap interval; ``nees_dof_truth_noise``: the same with the
-    truth's own noise added to what the method says. ``coverage``: per axis at 1, 2, 3 sigma, averaged over the axes.
-    ``nll_per_dim`` is that of a Gaussian, ``nll_stated_per_dim`` that of the stated Student-t, which expects a median
-    of ``nees_dof_median_stated``. ``energy``, ``correlation_gain_nats`` and the quartiles ``by_difficulty``: see
+    ``nees_dof`` by block of the error, with a block-bootstrap interval; ``nees_dof_truth_noise`` and all that follows:
+    with the truth's own noise added to what the method says. ``coverage``: per axis at 1, 2, 3 sigma, averaged over the
+    axes. ``nll_per_dim`` is that of a Gaussian, ``nll_stated_per_dim`` that of the stated Student-t, which expects a
+    median of ``nees_dof_median_stated``. ``energy``, ``correlation_gain_nats`` and the quartiles ``by_difficulty``: see
     :mod:`gpvo.stats.consistency`.
     ``one_second`` and ``horizons`` (1, 10, 100 m of path) are of windows without lost frames. ``axes``: those that
     count, of 0 to 5, :func:`gpvo.stats.consistency.seen_axes`; a block without any has no score.
@@ -105,7 +105,7 @@ def consistency(
     """Scores of one method, None where it says nothing about any motion with truth.
 
     ``T_true`` (N, 4, 4) and ``known`` (N,): truth at the log's stamps. ``noise`` (N, 6, 6): covariance of these.
-    ``by_velocity`` (N, 3): where the truth's own velocities lead (:func:`gpvo.dataset.errors.velocity_path`).
+    ``by_velocity`` (N, 3): where the truth's own velocities lead (:func:`gpvo.dataset.truth_noise.velocity_path`).
     """
     C = statement.covariance[errors.index]
     stated = np.isfinite(C).all(axis=(1, 2))

@@ -26,7 +26,7 @@ from gpvo.types import Array, Status
 def document(evaluations: Sequence[Evaluation]) -> dict[str, Any]:
     """The result for scripts; what could not be computed is None. SI units; the names are part of the interface.
 
-    ``pooled``: for each method, ``nll_per_dim`` and ``nees_dof`` (with the truth's noise) {``mean``, ``low``, ``high``}
+    ``pooled``: for each method, ``nll_per_dim`` and ``nees_dof``, with the truth's noise, {``mean``, ``low``, ``high``}
     over the runs. For each run, besides its name, counts, path length, ATE and segments:
 
     * ``degraded``: frames of that status, by the odometry or a model. ``lost`` are counted apart.
@@ -43,9 +43,9 @@ def document(evaluations: Sequence[Evaluation]) -> dict[str, Any]:
       remain of it, None if it does not matter.
     * ``truth_sigma`` {``translation_m``, ``rotation_rad``}: noise of the truth per pose, root mean square over axes,
       as used: what ``--truth-sigma`` says, else what the source states (``truth_sigma_stated``) or the run shows
-      (:func:`gpvo.dataset.errors.estimate_truth_noise`), whichever is larger. ``truth_sigma_axes``: by axis, x y z [m],
-      then [rad]. ``truth_tells_from_m``: length of path from which odometry's errors outweigh it; 0: every motion;
-      None: nowhere.
+      (:func:`gpvo.dataset.truth_noise.estimate_truth_noise`), whichever is larger. ``truth_sigma_axes``: by axis, x y z
+      [m], then [rad], over the run. ``truth_jitter_s``: the jitter of its stamps that these hold.
+      ``truth_tells_from_m``: length of path from which odometry's errors outweigh it; 0: every motion; None: nowhere.
     * ``fixed_rotation`` {``angle_deg``, ``rotvec_rad``, ``error_change``, ``lever_m``}: between truth and odometry,
       None if it does not matter; ``lever_m`` between their origins, 0 if that does not; ``error_change``: relative
       change of the errors over a second without them.
@@ -59,8 +59,9 @@ def document(evaluations: Sequence[Evaluation]) -> dict[str, Any]:
     For each method, besides NEES, coverage, NLL and CRPS:
 
     * ``axes``: those that count, named x y z rx ry rz; the rest never differ between odometry and truth.
-    * ``nees_dof_interval``: by block, 95 % interval [low, high] of ``nees_dof`` by a bootstrap over blocks of time.
-    * ``nees_dof_truth_noise``: by block, ``nees_dof`` with the truth's own noise added to what the method states.
+    * ``nees_dof`` and ``nees_dof_interval``, by block, the latter the 95 % interval [low, high] by a bootstrap over
+      blocks of time, are of what the method states alone; ``nees_dof_truth_noise`` and all other scores are with the
+      truth's own noise added to it.
     * ``energy`` {``translation_m``, ``rotation_rad``}: energy score, the CRPS for vectors; it rewards sharpness and
       honesty together. ``correlation_gain_nats``: how much likelier the stated correlations make the errors.
       ``by_difficulty`` {``nees_dof``, ``coverage`` at one sigma}: in quartiles of rising stated uncertainty.

@@ -11,7 +11,6 @@ import numpy as np
 from gpvo.dataset.build import predictions_of
 from gpvo.dataset.doubtful import without_wandering_truth
 from gpvo.dataset.errors import interpolate_truth, motion_errors, require_attitude
-from gpvo.dataset.noiseless import without_noise
 from gpvo.errors import GpvoError
 from gpvo.filters.propagation import DEFAULT_IMU_NOISE
 from gpvo.filters.run import Flight
@@ -90,7 +89,7 @@ def constants_of(runs: Sequence[Run]) -> Constants:
         if run.truth is None:
             raise GpvoError("has no ground truth to train a constant on", where=run.path)
         require_attitude(run.log, run.truth, run.path)
-        errors = motion_errors(without_wandering_truth(run.log, run.truth), without_noise(run.log, run.truth)[0])
+        errors = motion_errors(without_wandering_truth(run.log, run.truth), run.truth)
         if not len(errors.index):
             raise GpvoError("has no motion with ground truth at both ends", where=run.path)
         squares.append((errors.xi**2).mean(axis=0))

@@ -202,7 +202,7 @@ def test_several_runs_are_predicted_and_judged_together(tmp_path: Path):
     assert "is another file, not an earlier file of predictions" in refused.stderr
     told = gpvo("evaluate", *runs).stdout
     assert "mean of the 3 runs" in told
-    assert "NEES with the truth's own noise taken into account, NLL without" in told
+    assert "with the truth's own noise taken into account" in told
     two = gpvo("evaluate", *runs[:2]).stdout
     assert "mean of the 2 runs: too few for an interval" in two
 

@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 from evaluation_runs import make_run, stated_covariance
 from gpvo.dataset.errors import interpolate_truth, motion_errors
-from gpvo.dataset.truth_noise import of_motions
+from gpvo.dataset.truth_noise import TruthNoise, of_motions
 from gpvo.evaluation import consistency as module
 from gpvo.evaluation.consistency import Consistency, consistency, horizon
 from gpvo.evaluation.statements import Statement, predicted_statement, statements
@@ -27,7 +27,8 @@ MODEL = Path(__file__).parents[2] / "models" / "tunnel.gpvo"
 def _scores(log: VoLog, truth: TruthLog, sigma: tuple[float, float] = (0.0, 0.0)) -> dict[str, Consistency]:
     T_true, known = interpolate_truth(truth, log.t_ns)
     errors = motion_errors(log, truth)
-    found = {s.method: consistency(s, errors, log, T_true, known, np.repeat(sigma, 3)) for s in statements(log)}
+    noise = TruthNoise(np.repeat(sigma, 3)).of_poses(np.zeros((len(log), 6)))
+    found = {s.method: consistency(s, errors, log, T_true, known, noise) for s in statements(log)}
     return {m: c for m, c in found.items() if c is not None}
 
 
@@ -202,7 +203,7 @@ def test_the_mean_over_windows_scatters_as_that_of_so_many_independent_ones(tau_
         log = VoLog(list(flight.records))
         at_s, known = (log.t_ns - log.t_ns[0]) * 1e-9, np.ones(len(log), bool)
         statement = predicted_statement("learned", log, flight.predictions)
-        h = horizon(statement, log, flight.T_world_cam, known, at_s, 1.0, np.zeros(6), None, range(6))
+        h = horizon(statement, log, flight.T_world_cam, known, at_s, 1.0, None, None, range(6))
         nees.append(h.nees_dof)
         stated.append(np.sqrt(2 / (6 * h.independent)))
         assert h.independent < 0.5 * h.count

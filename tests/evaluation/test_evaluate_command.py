@@ -188,7 +188,7 @@ def _motions(log: VoLog) -> np.ndarray:
 def test_bad_flags_are_one_line(run_folder):
     for value in ("ten", "", "0", "-5", "nan", "10,,20", "inf"):
         _assert_refused(run_folder, "--segments", value, says="--segments")
-    for value in ("x", "-1", "1,2,3", "nan"):
+    for value in ("x", "-1", "1,2,3,4", "nan"):
         _assert_refused(run_folder, f"--truth-sigma={value}", says="--truth-sigma")
     for value in ("soon", "nan", "1,2"):
         _assert_refused(run_folder, "--time-offset", value, says="--time-offset")
@@ -258,7 +258,12 @@ def test_truth_from_a_file_takes_the_noise_that_it_is_given(run_folder, tmp_path
     write_tum(tmp_path / "truth.tum", run.truth.t_ns, run.truth.T_world_cam)
     args = ("evaluate", run_folder, "--truth", tmp_path / "truth.tum")
     assert "+truth" not in gpvo(*args)[1]
+    plain = json.loads(gpvo(*args, "--json")[1])["runs"][0]
     assert "10 mm" in gpvo(*args, "--truth-sigma", "0.01")[1]
+    found = json.loads(gpvo(*args, "--truth-sigma", "0,0,0.02", "--json")[1])["runs"][0]
+    assert found["truth_jitter_s"] == 0.02
+    assert max(found["truth_sigma_axes"]) > 0.0
+    assert found["methods"]["triangulation"]["nll_per_dim"] != plain["methods"]["triangulation"]["nll_per_dim"]
 
 
 def test_the_model_file_gives_constant_and_the_thesis_row(tmp_path):
