@@ -149,7 +149,7 @@ def build(
     records, X = observe(log, names, target)
     seen, noise = VoLog(records), TruthNoise()
     if target == "position":
-        Y, known = told, _ = position_targets(log, seen.usable, truth)
+        (Y, known), told = position_targets(log, seen.usable, truth), None
     else:
         drawn, noise = (truth, noise) if exact else without_noise(log, truth)
         (Y, known), (told, has) = (motion_targets(records, t) for t in (drawn, truth))
@@ -192,7 +192,7 @@ def build(
         target=target,
         lost_xi=as_if[has],
         lost_jump=jumps[has],
-        told=told[known] if noise else None,
+        told=told[known] if told is not None and noise else None,
         truth_noise=of_stamps(noise, log, truth, kept.column("t_prev_ns"), kept.t_ns) if noise else None,
     )
 

@@ -1,5 +1,5 @@
-"""The noise of the ground truth itself: how large it is, over what length of path it leaves odometry's errors visible,
-and the truth as it may have been without it.
+"""The noise of the ground truth itself: how large it is, what it adds to errors, and over what length of path it leaves
+odometry's errors visible.
 
 A truth is noisy in two ways that show from one frame to the next: each pose is off by white noise, and its stamp by
 jitter, which moves the pose along its way (KITTI's cameras are paired with the nearest of GPS/INS poses 10 ms apart).
@@ -58,20 +58,15 @@ class TruthNoise:
         return np.sqrt(self.sigma**2 + self.jitter_s**2 * way2)
 
 
-def of_motions(T_true: Array, of_start: Array, of_end: Array) -> Array:
-    """(M, 6, 6) covariance that the noise of two poses, ``of_start`` and ``of_end`` (M, 6, 6), adds to the errors of
-    the motions (M, 4, 4) between them: ``S_end + Ad(T)^-1 S_start Ad(T)^-T``, the MA(1) shape of a differenced pose."""
-    return compound(T_true, of_start, of_end)
-
-
 def of_stamps(
     noise: TruthNoise, log: VoLog, truth: TruthLog, t_prev_ns: NDArray[np.int64], t_ns: NDArray[np.int64]
 ) -> Array:
-    """(n, 6, 6) the same for motions between stamps (n,) of frames of the log."""
+    """(n, 6, 6) covariance that the noise of two poses adds to the error of the motion between them, for motions
+    between stamps (n,) of frames of the log: ``S_end + Ad(T)^-1 S_start Ad(T)^-T``."""
     T, known = interpolate_truth(truth, log.t_ns)
     of_poses = noise.of_poses(rates_of(T, log.t_ns, known))
     start, end = (np.searchsorted(log.t_ns, t).clip(max=len(T) - 1) for t in (t_prev_ns, t_ns))
-    return symmetrise(of_motions(se3.inverse(T[start]) @ T[end], of_poses[start], of_poses[end]))
+    return symmetrise(compound(se3.inverse(T[start]) @ T[end], of_poses[start], of_poses[end]))
 
 
 def rates_of(T: Array, t_ns: NDArray[np.int64], known: NDArray[np.bool_]) -> Array:

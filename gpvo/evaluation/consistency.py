@@ -11,10 +11,10 @@ from numpy.typing import ArrayLike, NDArray
 
 from gpvo.accumulation import PoseError, carry, over_windows
 from gpvo.dataset.errors import MotionErrors
-from gpvo.dataset.truth_noise import drift_variance, of_motions
+from gpvo.dataset.truth_noise import drift_variance
 from gpvo.evaluation.statements import Statement
 from gpvo.geometry import se3
-from gpvo.geometry.covariance import variances
+from gpvo.geometry.covariance import compound, variances
 from gpvo.learning.methods import score
 from gpvo.stats.consistency import (
     BLOCKS,
@@ -117,7 +117,7 @@ def consistency(
     per_block = nees_by_block(e, C, axes)
     if noise is not None:
         # From here on, errors are those of odometry and of the truth.
-        C = C + of_motions(errors.T_true[stated], noise[_starts(index, log)], noise[index])[:, :d, :d]
+        C = C + compound(errors.T_true[stated], noise[_starts(index, log)], noise[index])[:, :d, :d]
     with_noise = nees_by_block(e, C, axes)
     scores = score(errors.xi[stated], statement.mean[index], C, statement.nu, axes)
     energy = {unit: _energy(e, C, axes[np.isin(axes, BLOCKS[block])]) for unit, block in UNITS.items()}
@@ -202,7 +202,7 @@ def horizon(
     T_est = np.array([reduce(np.matmul, motion[chain], np.eye(4)) for chain in chains])
     C = over_windows(log.T_prev_cur, statement.errors, chains)
     e, drift = se3.log(se3.inverse(T) @ T_est), np.zeros(3)
-    own = np.zeros_like(C) if noise is None else of_motions(T, noise[starts], noise[ends])
+    own = np.zeros_like(C) if noise is None else compound(T, noise[starts], noise[ends])
     if by_velocity is not None:
         moved = T_true[ends, :3, 3] - T_true[starts, :3, 3] - (by_velocity[ends] - by_velocity[starts])
         drift = drift_variance(np.einsum("nji,nj->ni", T_true[ends, :3, :3], moved), e[:, :3])

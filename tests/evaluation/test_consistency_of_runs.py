@@ -11,11 +11,12 @@ import numpy as np
 import pytest
 from evaluation_runs import make_run, stated_covariance
 from gpvo.dataset.errors import interpolate_truth, motion_errors
-from gpvo.dataset.truth_noise import TruthNoise, of_motions
+from gpvo.dataset.truth_noise import TruthNoise
 from gpvo.evaluation import consistency as module
 from gpvo.evaluation.consistency import Consistency, consistency, horizon
 from gpvo.evaluation.statements import Statement, predicted_statement, statements
 from gpvo.geometry import se3
+from gpvo.geometry.covariance import compound
 from gpvo.io.run import read_run, write_run
 from gpvo.online.predictor import Predictor
 from gpvo.types import TruthLog, VoLog
@@ -121,13 +122,13 @@ def test_truth_noise_is_that_of_two_noisy_poses():
     sigma_m, sigma_rad = 0.003, 0.001
     sigma = np.repeat([sigma_m, sigma_rad], 3)
     of_pose = np.diag(sigma**2)[None]
-    np.testing.assert_allclose(of_motions(np.eye(4)[None], of_pose, of_pose)[0], np.diag(2 * sigma**2))
+    np.testing.assert_allclose(compound(np.eye(4)[None], of_pose, of_pose)[0], np.diag(2 * sigma**2))
     T = se3.exp(np.array([0.5, -0.2, 1.0, 0.3, -0.4, 0.2]))
     rng = np.random.default_rng(0)
     noise = rng.standard_normal((2, 20_000, 6)) * ([sigma_m] * 3 + [sigma_rad] * 3)
     measured = se3.inverse(se3.exp(noise[0])) @ T @ se3.exp(noise[1])
     sample = np.cov(se3.log(se3.inverse(measured) @ T).T)
-    C = of_motions(T[None], of_pose, of_pose)[0]
+    C = compound(T[None], of_pose, of_pose)[0]
     scale = np.sqrt(np.outer(np.diagonal(C), np.diagonal(C)))
     np.testing.assert_allclose(sample / scale, C / scale, atol=0.05)
 
