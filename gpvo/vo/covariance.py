@@ -168,9 +168,7 @@ class ResidualMoments:
 
     def plus(self, other: ResidualMoments, memory: float = 1.0) -> ResidualMoments:
         """Both together, this one fading."""
-        return ResidualMoments(
-            memory * self.A + other.A, memory * self.sums + other.sums, memory * self.freedom + other.freedom
-        )
+        return ResidualMoments(*(memory * a + b for a, b in zip(vars(self).values(), vars(other).values())))
 
     @property
     def sigmas(self) -> tuple[float, float]:
