@@ -148,8 +148,9 @@ def covariances_by_method(
 class ResidualMoments:
     """Two linear equations ``A [p^2, m^2] = sums`` for the variances of pointing and matching [px^2].
 
-    A residual's covariance is ``G S G^T + S`` with ``S = diag(p^2, p^2, m^2)``: the sums of squares of its image and of
-    its disparity part. ``freedom``: degrees of freedom of the residuals, after six went to the motion.
+    A residual's covariance is ``G S G^T + S``, ``S = diag(p^2, p^2, m^2)``: the mean square of each part is ``a p^2 + b
+    m^2``, and a share of ``a / (a + b)`` is pointing's. After a step of several baselines the row alone shows that: the
+    column is all disparity's. ``freedom``: degrees of freedom of the residuals, after six went to the motion.
     """
 
     A: Array
@@ -159,17 +160,15 @@ class ResidualMoments:
     @classmethod
     def of(cls, residuals: Array, G: Array) -> ResidualMoments:
         """Of the residuals (M, 3) of one motion, and their derivatives (3, 3, M) by the reference measurement."""
-        count, g2 = len(residuals), (G**2).sum(axis=2)
-        A = np.array([[g2[:2, :2].sum() + 2 * count, g2[:2, 2].sum()], [g2[2, :2].sum(), g2[2, 2] + count]])
-        freedom = max(3.0 * count - 6.0, 0.0)
-        squares = (residuals**2).sum(axis=0)
-        return cls(A * freedom / (3.0 * count), np.array([squares[0] + squares[1], squares[2]]), freedom)
+        by_u, by_v, by_d = (G**2 + np.eye(3)[:, :, None]).transpose(1, 0, 2)
+        by = np.stack([by_u + by_v, by_d]).reshape(2, -1)
+        share = by / by.sum(axis=0)
+        freedom = max(residuals.size - 6.0, 0.0)
+        return cls(share @ by.T * (freedom / residuals.size), share @ (residuals.T**2).ravel(), freedom)
 
     def plus(self, other: ResidualMoments, memory: float = 1.0) -> ResidualMoments:
         """Both together, this one fading."""
-        return ResidualMoments(
-            memory * self.A + other.A, memory * self.sums + other.sums, memory * self.freedom + other.freedom
-        )
+        return ResidualMoments(*(memory * a + b for a, b in zip(vars(self).values(), vars(other).values())))
 
     @property
     def sigmas(self) -> tuple[float, float]:

@@ -82,11 +82,13 @@ class _View:
 @dataclass(frozen=True)
 class _Found:
     """What the search in the right image came to: for each point sought ``seen``, whether it can be believed, ``good``
-    (N,), and by how much the right row lies below the left one, ``row_error`` (N,), NaN where nothing was found."""
+    (N,), by how much the right row lies below the left one, ``row_error`` (N,), NaN where nothing was found, and
+    whether that image should show it at all, ``inside`` (N,)."""
 
     seen: _Seen
     good: NDArray[np.bool_]
     row_error: Array
+    inside: NDArray[np.bool_]
 
 
 @dataclass(frozen=True)
@@ -312,9 +314,9 @@ class KltFrontend:
         uvd = np.column_stack([uv_left[:, 0], uv_left[:, 1] + 0.5 * row_error, d])
         limit = config.max_disparity_share * self._camera.width
         found &= near.alike
-        good = self._rig_error.allows(uvd, row_error, config.min_disparity_px, limit, config.max_row_error_px)
+        good = found & self._rig_error.allows(uvd, row_error, config.min_disparity_px, limit, config.max_row_error_px)
         seen = _Seen(uv_left, uvd, (1.0, 0.0) - near.A[:, 0], patches)
-        return _Found(seen, found & good, np.where(found, row_error, np.nan))
+        return _Found(seen, good, np.where(found, row_error, np.nan), good | (guess[:, 0] >= 0))
 
     def _right_search(self, both: _Found, row_motion: Array) -> RightSearch:
         """What the search in the right image came to; the first points were followed and have moved down so far."""
@@ -323,14 +325,15 @@ class KltFrontend:
         disparity, row_error = uvd[:, 2] - d_expected, both.row_error - row_expected
         # A pair that is off by the same rows everywhere is still a pair: its rows are counted from there.
         usual = float(np.median(row_error[np.isfinite(row_error)])) if np.isfinite(row_error).any() else 0.0
-        off_row = np.abs(row_error - usual) > self._config.max_row_error_px
+        off_row = both.inside & (np.abs(row_error - usual) > self._config.max_row_error_px)
         least_px = self._config.min_disparity_px
-        behind = np.isfinite(row_error) & ~off_row & (disparity < min(least_px, -KNOWN_DEPTH_PX))
-        # Points at infinity have no measurable depth, which is nobody's fault.
-        far = np.isfinite(row_error) & ~behind & (disparity < max(least_px, KNOWN_DEPTH_PX))
+        known = both.inside & np.isfinite(row_error)
+        behind = known & ~off_row & (disparity < min(least_px, -KNOWN_DEPTH_PX))
+        # Points at infinity have no measurable depth, which is nobody's fault; nor is what lies beyond the image.
+        far = known & ~behind & (disparity < max(least_px, KNOWN_DEPTH_PX))
         seen = np.abs(row_error[:n]) < self._config.klt_window_px
         return RightSearch(
-            len(uvd) - int(far.sum()),
+            int((both.inside & ~far).sum()),
             int((both.good & ~off_row & ~far & ~behind).sum()),
             int(behind.sum()),
             int(off_row.sum()),

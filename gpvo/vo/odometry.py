@@ -100,8 +100,7 @@ class StereoOdometry:
         doubts = self.pair.step(seen, matches.right)
         motion, choice = self._choose(matches, motion, guess, frame.t_ns, doubts)
         clock.lap("motion")
-        raw = self._raw
-        self.last = Followed(raw, np.zeros(len(raw.uvd_cur), bool) if motion is None else motion.inliers)
+        self.last = Followed(self._raw, np.zeros(len(self._raw.uvd_cur), bool) if motion is None else motion.inliers)
         verdict = judge(
             matches,
             motion,
@@ -220,8 +219,7 @@ class StereoOdometry:
         if (among & agrees(T_prev_cur, matches, camera, tolerance_px)).sum() < config.min_inliers:
             return None
         uvd_prev, uvd_cur = matches.uvd_prev[among], matches.uvd_cur[among]
-        noise = self._noise.value
-        motion = refine(T_prev_cur, uvd_prev, uvd_cur, camera, noise=noise, tolerance_px=tolerance_px)
+        motion = refine(T_prev_cur, uvd_prev, uvd_cur, camera, noise=self._noise.value, tolerance_px=tolerance_px)
         if motion is None:
             return None
         inliers = np.zeros(len(among), bool)
@@ -293,8 +291,7 @@ class StereoOdometry:
                 return False, (matches.n_tracked, matches.n_tracked)
             # A good image that fits nothing known is a new beginning; a bad one leaves the old reference standing
             # while it may be found again.
-            keep = state.is_fresh(record.t_ns, config.weak_inliers)
-            enough = config.weak_inliers if keep else config.min_inliers
+            enough = config.weak_inliers if state.is_fresh(record.t_ns, config.weak_inliers) else config.min_inliers
             counts = self._frontend.promote(None, at_least=enough)
             if counts[1] < enough:
                 return False, counts
@@ -305,8 +302,7 @@ class StereoOdometry:
         state.believe(record.t_ns, record.T_prev_cur, parallax_px, int(inliers.sum()), tells=tells)
         if state.suffices(parallax_px, config) and inliers.sum() > 0.6 * state.reference_points:
             return False, (state.reference_points, state.reference_points)
-        kept = inliers if state.rival is None else state.rival
-        counts = self._frontend.promote(kept, at_least=config.min_inliers)
+        counts = self._frontend.promote(inliers if state.rival is None else state.rival, config.min_inliers)
         if counts[1] < config.min_inliers:
             return False, counts
         state.restart(record.t_ns, counts[1])

@@ -69,6 +69,28 @@ def test_sigmas_of_few_points(count: int) -> None:
     assert np.mean(scores) < 10
 
 
+@pytest.mark.parametrize("baselines", [0.5, 4.0, 10.0])
+def test_a_long_step_does_not_hide_pointing(baselines: float) -> None:
+    """Sideways by so many baselines, 0.05 px of each camera: NEES/dof stays near one (it was 23 at four, 140 at ten).
+
+    Noise of disparity moves points by as many times as much, and what it shares with the column is in neither sigma.
+    """
+    rng = np.random.default_rng(3)
+    sigmas, scores = SigmaEstimator(None, None), []
+    for k in range(80):
+        _, before, _ = scene(rng, 150, (4.0, 30.0))
+        T = se3.exp(np.r_[baselines * CAMERA.baseline_m, 0.01, 0.01, rng.normal(0.0, 0.01, 3)])
+        after = transfer(T, before, CAMERA).uvd.T
+        motion = refine(T, noisy(rng, before, 0.05), noisy(rng, after, 0.05), CAMERA)
+        assert motion is not None
+        sigmas.update(ResidualMoments.of(motion.residuals, whitened(motion, CAMERA).moved.G))
+        if k >= 20:
+            S = pointing_matching_pixel_covariance(*sigmas.values)
+            e = se3.log(se3.inverse(T) @ motion.T_prev_cur)
+            scores.append(e @ np.linalg.solve(motion_covariance(motion.T_prev_cur, motion.uvd_prev, CAMERA, S).full, e))
+    assert 0.7 < np.mean(scores) / 6 < 1.5
+
+
 @pytest.mark.parametrize(("shared_px", "least", "most"), [(0.0, 0.85, 1.15), (0.15, 2.5, 8.0)])
 def test_points_that_err_alike_count_as_fewer(shared_px: float, least: float, most: float) -> None:
     """Noise of 0.15 px by point, and noise common to each eighth of the image; NEES/dof stays near one by it."""

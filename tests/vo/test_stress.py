@@ -15,11 +15,13 @@ from gpvo.types import Status, StereoFrame
 from gpvo.vo import opencv
 from gpvo.vo.config import make_config
 from gpvo.vo.frontend import Matches, Observation, RightSearch
+from gpvo.vo.klt import KltFrontend
 from gpvo.vo.motion import Motion, refine, transfer
 from gpvo.vo.odometry import StereoOdometry
 from gpvo.vo.opencv import Light, halve, in_light_of
 from gpvo.vo.patches import align, cut
 from gpvo.vo.quality import PairWatch
+from gpvo.vo.rig_error import RigError
 from gpvo.vo.rivals import areas, unexplained, untangled
 from stereo_points import CAMERA, scene
 
@@ -241,6 +243,20 @@ def test_wrong_partners_speak_louder_than_missing_ones() -> None:
             doubts = watch.step(Observation(None, False), RightSearch(100, 75, 0, off_row, nothing, nothing))
         assert any("found in the right image" in d for d in doubts) is named
         assert watch.findings() == []  # most points are well
+
+
+def test_points_beyond_the_right_image_are_not_missing() -> None:
+    """A wall so near that the right camera sees four fifths of what the left one does; nothing else is wrong."""
+    camera, rng = pinhole(480, 360), np.random.default_rng(0)
+    wall = np.kron(rng.integers(0, 256, (90, 150)), np.ones((4, 4))).astype(np.uint8)
+    frontend = KltFrontend(camera, RigError(camera), make_config())
+    for t_ns in (1, 2):
+        frontend.observe(StereoFrame(t_ns, wall[:, :480].copy(), wall[:, 96:576].copy()))
+        right = frontend.match(np.eye(4)).right
+        frontend.promote(None)
+    assert right is not None
+    assert right.found > 0.95 * right.sought > 150
+    assert right.off_row + right.behind < 0.02 * right.sought
 
 
 def test_a_scene_speaks_against_a_patch_with_more_points() -> None:
