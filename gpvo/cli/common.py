@@ -262,6 +262,12 @@ def is_given(ctx: typer.Context, option: str) -> bool:
     return source is not None and source.name != "DEFAULT"
 
 
+def refuse_idle(ctx: typer.Context, names: Iterable[str], why: str, cure: str) -> None:
+    """Raise GpvoError for the first of these options that the user gave, though nothing will read it: ``why``."""
+    if idle := [name for name in names if is_given(ctx, name)]:
+        raise GpvoError(f"--{idle[0].strip('_').replace('_', '-')} has no effect {why}", cure=cure)
+
+
 def refuse_twice(paths: Iterable[Path]) -> None:
     """Raise GpvoError for one that is given twice: it would narrow every interval, and judge training on itself."""
     seen: set[Path] = set()

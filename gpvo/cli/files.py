@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import Annotated, Any
 
 import numpy as np
+import typer
 
 from gpvo.cli import common as options
 from gpvo.cli.describe import as_lines, describe
@@ -26,6 +27,11 @@ from gpvo.io.stated import to_records
 from gpvo.io.trajectory import check_overlap
 from gpvo.online.slip import flag_slips
 from gpvo.types import Mounting, TruthLog, Vehicle, VoLog
+
+
+_OF_LOGS = (
+    "format_", "map_", "topic", "frame", "covariance_of", "covariance_axes", "vehicle", "max_acceleration", "max_turn",
+)  # fmt: skip
 
 
 @dataclass(frozen=True)
@@ -192,6 +198,7 @@ def info(
 
 
 def import_(
+    ctx: typer.Context,
     log: Annotated[Path, "Trajectory, CSV or bag of another odometry; or a run, to give it ground truth."],
     out: Annotated[Path, "Run folder to write."],
     truth: Annotated[Path | None, "Ground truth of the same frame, or see --align: a trajectory, CSV or bag."] = None,
@@ -245,22 +252,21 @@ def import_(
     of_truth: dict[str, Any] = {"mapping": truth_mapping, "topic": truth_topic, "complete": True}
     read = partial(read_foreign, times=times, rate_hz=rate_hz)
     fit: dict[str, Any] = {"align": align, "time_offset_s": offset, "truth_sigma": sigma, "overwrite": overwrite}
+    of_run = is_run(log) or log.suffix == ".parquet"  # a run's own table is no log, as reading it as a run says
+    if of_run:  # which knows what it holds, and of which only truth changes
+        cure = "leave it out; --align transform fits a truth of another frame"
+        options.refuse_idle(ctx, _OF_LOGS, f"on a run, as {log} is", cure)
+    if truth is None:
+        idle = ("truth_format", "truth_map", "truth_topic", *(() if of_run else ("align", "truth_sigma")))
+        options.refuse_idle(ctx, idle, "without ground truth", "give it with --truth")
     with progress("logs", 1):
         given = None if truth is None else read(truth, truth_format, **of_truth)
-        if is_run(log) or log.suffix == ".parquet":  # a run's own table is no log, as reading it as a run says
-            _refuse_of_a_run(log, {"frame": frame != "auto", "format": format_, "map": map_, "topic": topic})
+        if of_run:
             summary = add_truth(read_run(log), given, out, **fit)
         else:
             foreign = read(log, format_, mapping=mapping, topic=topic, **stated)
             summary = import_log(foreign, given, out, frame=frame, vehicle=vehicle.bounds(), **fit)
     answer(json_, {"schema": 1, "run": str(out), **vars(summary)}, lambda: print(f"{out}: {summary}"))
-
-
-def _refuse_of_a_run(run: Path, given: dict[str, Any]) -> None:
-    """Refuse what says how a file is read: a run knows, and its poses are those of its left camera."""
-    if names := [name for name, value in given.items() if value]:
-        cure = "leave it out; --align transform fits a truth of another frame"
-        raise SourceError(f"--{names[0]} has no effect on a run", where=run, cure=cure)
 
 
 def _mapping(option: str, texts: list[str]) -> dict[str, str]:

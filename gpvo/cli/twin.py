@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import numpy as np
 import typer
 
-from gpvo.cli.common import is_given
+from gpvo.cli.common import refuse_idle
 from gpvo.cli.output import Json, answer, note, print_json, progress, say, show
 from gpvo.dataset.errors import require_attitude
 from gpvo.errors import GpvoError
@@ -52,8 +52,7 @@ class TwinOptions:
         """
         if twins:
             return self.settings(seed)
-        if idle := [name for name in (*(f.name for f in fields(self)), *others) if is_given(ctx, name)]:
-            raise GpvoError(f"--{idle[0]} has no effect without --twins", cure="add --twins")
+        refuse_idle(ctx, (*(f.name for f in fields(self)), *others), "without --twins", "add --twins")
         return None
 
 
