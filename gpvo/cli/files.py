@@ -28,7 +28,6 @@ from gpvo.io.trajectory import check_overlap
 from gpvo.online.slip import flag_slips
 from gpvo.types import Mounting, TruthLog, Vehicle, VoLog
 
-
 _OF_LOGS = (
     "format_", "map_", "topic", "frame", "covariance_of", "covariance_axes", "vehicle", "max_acceleration", "max_turn",
 )  # fmt: skip

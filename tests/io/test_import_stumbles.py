@@ -114,6 +114,32 @@ def test_the_36_numbers_of_ros_by_their_place_in_the_row(name: str, tmp_path: Pa
     assert log.notes == ()
 
 
+@pytest.mark.parametrize("unit", ["_mm", " [mm]", "(cm)", "_km", "_m", " [ft]"])
+def test_positions_are_in_the_unit_of_their_column(unit: str, tmp_path: Path) -> None:
+    """They were read as metres where brackets named another unit, or ``--map`` the column."""
+    metres = {"mm": 1e-3, "cm": 1e-2, "km": 1e3, "m": 1.0, "ft": 0.3048}[unit.strip(" _[]()")]
+    rows = [f"{k * 0.1:.1f},{200.0 * k / metres!r},{-3.0 / metres!r},0,0,0,0,1" for k in range(5)]
+    names = [f"{a}{unit}" for a in "xyz"]
+    (tmp_path / "log.csv").write_text("\n".join([",".join(["t", *names, "qx,qy,qz,qw"]), *rows]))
+    for mapping in ({}, dict(zip(names, ("p_x", "p_y", "p_z")))):
+        log = read_foreign(tmp_path / "log.csv", mapping=mapping)
+        np.testing.assert_allclose(log.trajectory.T_world_body[4, :3, 3], [800, -3, 0], rtol=1e-12)
+        assert log.notes == ()
+
+
+def test_covariances_are_in_the_unit_of_their_column(tmp_path: Path) -> None:
+    """As logged in millimetres and degrees, squared; those of unnamed units beside such positions are remarked."""
+    names = [f"var_{a} [mm^2]" for a in "xyz"] + [f"var_{a}_deg2" for a in ("roll", "pitch", "yaw")]
+    log = read_foreign(_csv(tmp_path / "log.csv", ",".join(names), "1,4,9,1,4,9"))
+    degree = np.pi / 180
+    assert log.covariance is not None
+    np.testing.assert_allclose(np.sqrt(np.diagonal(log.covariance[0])), [1e-3, 2e-3, 3e-3, *degree * np.arange(1, 4)])
+    path = _csv(tmp_path / "mixed.csv", "cov_xx,cov_yy,cov_zz,cov_rollroll,cov_pitchpitch,cov_yawyaw", "1,2,3,4,5,6")
+    path.write_text(path.read_text().replace(",x,", ",x_mm,", 1))
+    [note] = read_foreign(path).notes
+    assert "x_mm is converted to metres, the covariances, which name no unit, are not" in note
+
+
 def test_of_a_twist_they_are_not_the_poses(tmp_path: Path) -> None:
     names = ",".join(f"twist.covariance[{k}]" for k in range(36))
     log = read_foreign(_csv(tmp_path / "log.csv", names, ",".join(["1"] * 36)))
