@@ -37,11 +37,12 @@ def fuse(
 
     Example: gpvo fuse runs/flight7 --model models/tunnel.gpvo --plot fuse.png
     """
-    from gpvo.evaluation.fusion import FusionSettings, document, fuse_runs, write_log
-    from gpvo.filters.measurement import Gate
-    from gpvo.filters.policies import LEARNED
-    from gpvo.filters.run import FuseOptions
-    from gpvo.filters.study import table
+    with status("starting"):
+        from gpvo.evaluation.fusion import FusionSettings, document, fuse_runs, write_log
+        from gpvo.filters.measurement import Gate
+        from gpvo.filters.policies import LEARNED
+        from gpvo.filters.run import FuseOptions
+        from gpvo.filters.study import table
 
     refuse_twice(runs)
     judging = twin_options.asked(ctx, twins, seed, "seed")

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from gpvo.cli.common import is_given, refuse_twice
-from gpvo.cli.output import Json, cell, note, print_json, progress, say, show, time_offset
+from gpvo.cli.output import Json, cell, note, print_json, progress, say, show, status, time_offset
 from gpvo.cli.twin import TwinOptions, Twins, in_place_of_runs_without_truth
 from gpvo.dataset.errors import made_from_odometry, motion_errors, outweighed_by_truth
 from gpvo.errors import GpvoError
@@ -71,7 +71,8 @@ def train(
 
     Example: gpvo train runs/a runs/b runs/c -o errors.gpvo
     """
-    from gpvo.learning.store import config_of, folds_path, refuse_foreign_model, save_model
+    with status("starting"):
+        from gpvo.learning.store import config_of, folds_path, refuse_foreign_model, save_model
 
     refuse_foreign_model(out)
     settings = asdict(options) | {"time_offset_s": time_offset(options.time_offset_s)}

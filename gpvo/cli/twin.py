@@ -13,7 +13,7 @@ import numpy as np
 import typer
 
 from gpvo.cli.common import refuse_idle
-from gpvo.cli.output import Json, answer, note, print_json, progress, say, show
+from gpvo.cli.output import Json, answer, note, print_json, progress, say, show, status
 from gpvo.dataset.errors import require_attitude
 from gpvo.errors import GpvoError
 from gpvo.io.run import Run, read_run
@@ -39,8 +39,9 @@ class TwinOptions:
 
     def settings(self, seed: int) -> TwinSettings:
         """The flags, parsed. Raises GpvoError for an unknown tolerance or a file without a gap."""
-        from gpvo.twin.gap import read_gap
-        from gpvo.twin.replicate import TwinSettings, read_tolerance
+        with status("starting"):
+            from gpvo.twin.gap import read_gap
+            from gpvo.twin.replicate import TwinSettings, read_tolerance
 
         name, sigma = read_tolerance(self.tolerance)
         return TwinSettings(self.replicates, sigma, name, seed, None if self.gap is None else read_gap(self.gap))

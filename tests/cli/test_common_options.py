@@ -267,3 +267,31 @@ def test_a_long_log_is_not_worked_on_in_silence(tmp_path: Path, bar: str, words:
     os.close(reader)
     assert process.returncode == 0, shown
     assert f"{bar} ".encode() in shown
+
+
+@pytest.mark.parametrize(
+    ("slow", "words"),
+    [
+        ("gpvo.learning.store", ["train", "a", "-o", "m.gpvo"]),
+        ("gpvo.twin.replicate", ["evaluate", "a", "--twins"]),
+        ("gpvo.twin.replicate", ["twin", "a", "-o", "twins"]),
+        ("gpvo.evaluation.fusion", ["fuse", "a", "--twins"]),
+    ],
+)
+def test_a_terminal_shows_something_before_what_takes_seconds_to_load(slow: str, words: list[str]):
+    script = f"""
+import io, os, sys
+from gpvo.cli import app, output
+from rich.console import Console
+shown = io.StringIO()
+output._terminal = lambda: Console(file=shown, force_terminal=True)
+class Watching:
+    def find_spec(self, name, *_):
+        if name == {slow!r}:
+            print(bool(shown.getvalue()), file=sys.__stdout__, flush=True)
+            os._exit(0)
+sys.meta_path.insert(0, Watching())
+app({words!r})
+"""
+    done = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True, timeout=120)
+    assert done.stdout == "True\n", done.stderr
