@@ -48,6 +48,11 @@ class Groups(TyperGroup):
                 formatter.write_dl([(name, (c.help or "").split("\n\n")[0].strip()) for name, c in commands])
 
 
+CovarianceAxes = Annotated[
+    str,
+    "Axes of covariances of poses: world, body, mixed (those of the rotation alone are the body's), or auto: mixed for"
+    " columns of OpenVINS' names, else world.",
+]
 Config = Annotated[Path | None, "TOML file of options, one table per command. The command line takes precedence."]
 Quiet = Annotated[bool, "-q", "--quiet", "No progress and no notes."]
 Verbose = Annotated[bool, "-v", "--verbose", "Also print settings, time and memory."]

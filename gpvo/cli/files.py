@@ -224,11 +224,7 @@ def import_(
     time_offset: Annotated[str, "Seconds to add to the stamps of the log, or auto."] = "0",
     truth_sigma: Annotated[str | None, "White noise of the truth per pose, METRES,RADIANS."] = None,
     covariance_of: Annotated[str, "Whether the covariances in a CSV are of poses or motions."] = "pose",
-    covariance_axes: Annotated[
-        str,
-        "Axes of covariances of poses: world, body, mixed (those of the rotation alone are the body's), or auto: mixed "
-        "for columns of OpenVINS' names, else world.",
-    ] = "auto",
+    covariance_axes: options.CovarianceAxes = "auto",
     vehicle: options.VehicleOptions = options.VehicleOptions(),
     overwrite: options.Overwrite = False,
     json_: Json = False,

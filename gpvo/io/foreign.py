@@ -188,7 +188,7 @@ def _from_table(path: Path, table: Table, covariance_of: str, axes: str, complet
     trajectory = Trajectory(t, se3.from_quaternion(pose[:, :3], pose[:, 3:]))
     cov = _table_covariance(c, known)
     if cov is not None:
-        cov = _into_body(trajectory, cov, axes)
+        cov = into_body(trajectory.T_world_body, cov, axes)
         still = still_axes(trajectory.T_world_body)
         stated = np.array([f"cov_{i}{i}" in c for i in range(6)])
         planar = (stated | still).all() and stated[3:].any()  # of the position alone, it says nothing of the motion
@@ -229,12 +229,13 @@ def _table_covariance(columns: Mapping[str, Array], known: NDArray[np.bool_]) ->
     return np.where(np.isfinite(C), C, np.nan)
 
 
-def _into_body(trajectory: Trajectory, covariance: Array, axes: str) -> Array:
-    """Covariances of fixed axes, unless ``axes`` says otherwise, turned into those of the moving frame."""
+def into_body(T_world_body: Array, covariance: Array, axes: str) -> Array:
+    """Covariances (..., 6, 6) of poses (..., 4, 4) in ``axes``, of :data:`COVARIANCE_AXES`, turned into those of the
+    moving frame; ``auto``: from the world's."""
     if axes == "body":
         return covariance
     of_rotation = np.eye(3) if axes == "mixed" else None
-    return se3.rotate_covariance(np.swapaxes(trajectory.T_world_body[:, :3, :3], -1, -2), covariance, of_rotation)
+    return se3.rotate_covariance(np.swapaxes(T_world_body[..., :3, :3], -1, -2), covariance, of_rotation)
 
 
 def still_axes(T_world_body: Array) -> NDArray[np.bool_]:
@@ -311,7 +312,7 @@ def _read_bag_topic(path: Path, topic: str, axes: str, complete: bool) -> Foreig
     stated = (covariances_of(read, name) for name in ("twist", "pose"))
     twist, pose = (None if C is None else np.where(np.isfinite(C), C, np.nan) for C in stated)
     still = still_axes(T)
-    pose = None if pose is None else definite_in_plane(_into_body(log.trajectory, pose, axes), still)
+    pose = None if pose is None else definite_in_plane(into_body(T, pose, axes), still)
     twist = None if twist is None else definite_in_plane(twist, still)
     if twist is not None and _looks_stated(twist):
         # Of the velocity in the child frame over the step that ends at the stamp.
