@@ -181,6 +181,19 @@ def test_a_narrow_terminal_breaks_no_number_and_a_closed_one_no_command():
     assert (done.returncode, done.stderr) == (0, "")
 
 
+def test_a_name_that_the_terminal_cannot_show_stops_no_command(tmp_path: Path):
+    """As in a locale of ASCII, or in a pipe on Windows: it ended in a traceback, with the work done."""
+    run = shutil.copytree(UNSEEN, tmp_path / "Flüge 飛行")
+    env = {**os.environ, "PYTHONIOENCODING": "ascii"}
+    words = [sys.executable, "-m", "gpvo", "info", str(run)]
+    done = subprocess.run(words, capture_output=True, text=True, timeout=120, env=env)
+    assert (done.returncode, done.stderr) == (0, "")
+    assert "Fl\\xfcge \\u98db\\u884c" in done.stdout
+    env = {**os.environ, "PYTHONUTF8": "0", "LC_ALL": "C"}
+    done = subprocess.run(words, capture_output=True, text=True, timeout=120, env=env)
+    assert done.returncode == 0 or "(set PYTHONUTF8=1, or rename the file)" in done.stderr
+
+
 def test_tables_fit_80_columns():
     done = gpvo("evaluate", UNSEEN, "--model", MODEL, "--truth-sigma", "0.01")
     rows = [
