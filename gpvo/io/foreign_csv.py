@@ -15,6 +15,7 @@ from gpvo.errors import SourceError
 from gpvo.io.stamps import (
     UNITS_NS,
     check_interval,
+    cure_of_end,
     cure_of_number,
     integer_ns,
     is_number,
@@ -110,7 +111,9 @@ def read_table(path: Path, mapping: Mapping[str, str]) -> Table:
         if len(rows) >= _MAX_ROWS:
             raise SourceError(f"has more than {_MAX_ROWS} rows", where=path)
         if len(fields) < len(header) or any(fields[len(header) :]):  # empty: VINS ends its lines with a comma
-            cure = None if len(fields) < len(header) else "name every column, and write numbers with a decimal point"
+            cure = "name every column, and write numbers with a decimal point"
+            if len(fields) < len(header):
+                cure = cure_of_end(path, number) if rows else None
             what = f"line {number} holds {len(fields)} fields, the header {len(header)}"
             raise SourceError(what, where=path, cure=cure)
         text = fields[targets[stamp]]

@@ -159,7 +159,7 @@ def guess(path: str | Path) -> str:
         where=p,
         cure="known are EuRoC/ASL (mav0/), KITTI odometry (calib.txt, image_0/), ROS bags (.bag, .db3, .mcap, or a"
         " folder of those of one recording), image pairs with a camchain.yaml, and tracks (.npz); name one with"
-        " --source",
+        " --source; poses alone are for 'gpvo import'",
     )
 
 

@@ -17,6 +17,7 @@ from gpvo.io.stamps import (
     Stamps,
     astray,
     check_interval,
+    cure_of_end,
     cure_of_number,
     cure_of_seconds,
     cure_of_unit,
@@ -164,7 +165,9 @@ def _read_poses(
     numbers, stamps, poses, behind = [], [], [], []
     for number, fields in _fields(path, separator):
         if len(fields) not in counts:
-            cure = None if separator else "'gpvo import', of a log or as --truth of a run, takes CSV, KITTI and bags"
+            cure = cure_of_end(path, number) if numbers and len(fields) < counts.start else None
+            others = "'gpvo import', of a log or as --truth of a run, takes CSV, KITTI and bags"
+            cure = cure or (None if separator else others)
             raise SourceError(f"line {number} holds {len(fields)} fields, expected {what}", where=path, cure=cure)
         try:
             stamps.append(stamp(fields[0]))

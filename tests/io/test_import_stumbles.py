@@ -14,6 +14,7 @@ from gpvo.cli.files import import_log
 from gpvo.errors import CalibrationError, SourceError
 from gpvo.io import open_source
 from gpvo.io.foreign import read_foreign
+from gpvo.io.run_read import read_run
 from gpvo.io.trajectory import read_tum
 
 POSE = "0,0,0,0,0,0,1"
@@ -204,3 +205,33 @@ def test_an_uncertainty_that_nothing_reads_is_named(names: str, tmp_path: Path) 
     more = ",0.01" * len(names.split(","))
     path.write_text(f"{HEAD},{names}\n0.0,{POSE}{more}\n0.1,{POSE}{more}\n")
     assert any(f"columns not used: {names.replace(',', ', ')};" in note for note in read_foreign(path).notes)
+
+
+@pytest.mark.parametrize("name", ["log.tum", "log.csv"])
+def test_a_file_that_breaks_off_in_a_line_is_told_from_one_of_another_kind(name: str, tmp_path: Path) -> None:
+    """As of a full disk or a kill: the cure is that line, not another command."""
+    separator, path = "," if name.endswith("csv") else " ", tmp_path / name
+    lines = [separator.join([f"{k * 0.1:.1f}", *POSE.split(",")]) for k in range(5)]
+    head = ["t,x,y,z,qx,qy,qz,qw"] * (separator == ",")
+    path.write_text("\n".join([*head, *lines])[:-5])
+    with pytest.raises(SourceError, match="the file breaks off in this line: remove it"):
+        read_foreign(path)
+    short = lines[2][:-5]
+    path.write_text("\n".join([*head, *lines[:2], short, *lines[3:]]))
+    with pytest.raises(SourceError) as raised:
+        read_foreign(path)
+    assert "breaks off" not in str(raised.value)
+
+
+def test_poses_alone_are_sent_to_import(tmp_path: Path) -> None:
+    """What has no images is no sequence, and no run yet: each refusal said how to make a run of images."""
+    maker = BagMaker(ros1=False)
+    for t, T in zip(seq.stamps(12), seq.true_poses(12), strict=True):
+        maker.odometry("/wheels/odom", t, T, np.eye(6), np.eye(6))
+    bag = maker.write(tmp_path / "bag")
+    log = _csv(tmp_path / "log.csv", "a", "1")
+    for path in (bag, log):
+        with pytest.raises(SourceError, match="'gpvo import'"):
+            open_source(path)
+        with pytest.raises(SourceError, match="or 'gpvo import' of poses"):
+            read_run(path)
