@@ -15,7 +15,7 @@ from gpvo.cli.common import refuse_twice
 from gpvo.cli.output import Json, cell, numbers, print_json, progress, say, show, time_offset
 from gpvo.cli.twin import TWINS, Seed, TwinOptions, make_all, say_simulated
 from gpvo.errors import GpvoError
-from gpvo.files import in_metres, refuse_foreign
+from gpvo.files import in_metres, refuse_folder, refuse_foreign
 from gpvo.io.run import Run, read_run
 from gpvo.io.source import open_source
 from gpvo.io.trajectory import read_tum
@@ -76,6 +76,8 @@ def evaluate(
     from gpvo.evaluation.document import document, pooled
     from gpvo.evaluation.evaluate import distinct
 
+    for folder in (stated, tables, plots):
+        refuse_folder(folder)
     settings = twin_options.asked(ctx, twins, seed, "seed")
     if settings is not None:
         documents, found = _with_twins(*_loaded(runs, judge), judge.model, judge.options(), settings)

@@ -12,6 +12,7 @@ import typer
 from gpvo.cli.common import refuse_twice
 from gpvo.cli.output import Json, answer, one_of, print_json, progress, say, status
 from gpvo.cli.twin import Seed, TwinOptions, Twins, in_place_of_runs_without_truth, say_simulated
+from gpvo.files import refuse_folder
 from gpvo.publish import PublishSettings
 
 
@@ -45,6 +46,7 @@ def fuse(
         from gpvo.filters.study import table
 
     refuse_twice(runs)
+    refuse_folder(log)
     judging = twin_options.asked(ctx, twins, seed, "seed")
     one_of("--init", init, ("truth", "static"))
     one_of("--gate", gate, ("discard", "inflate"))

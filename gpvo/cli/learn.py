@@ -15,6 +15,7 @@ from gpvo.cli.output import Json, cell, note, print_json, progress, say, show, s
 from gpvo.cli.twin import TwinOptions, Twins, in_place_of_runs_without_truth
 from gpvo.dataset.errors import made_from_odometry, motion_errors, outweighed_by_truth
 from gpvo.errors import GpvoError
+from gpvo.files import refuse_folder
 from gpvo.io.run import read_run
 from gpvo.io.run_read import read_meta
 
@@ -80,6 +81,7 @@ def train(
         settings = asdict(config_of(update)) | {k: v for k, v in settings.items() if is_given(ctx, k)}
     settings |= {"jobs": jobs, "backend": backend, "scheduler": scheduler}
     settings["keep"] = str(folds_path(out)) if backend == "local" else None
+    refuse_folder(statements)
     if statements is not None:
         _check_statements(runs, settings, update)
     drawn = twin_options.asked(ctx, twins, options.seed)
