@@ -14,7 +14,7 @@ import typer
 from gpvo.cli.common import refuse_twice
 from gpvo.cli.output import Json, cell, numbers, print_json, progress, say, show, time_offset
 from gpvo.cli.twin import TWINS, Seed, TwinOptions, make_all, say_simulated
-from gpvo.errors import GpvoError
+from gpvo.errors import GpvoError, counted
 from gpvo.files import in_metres, refuse_folder, refuse_foreign
 from gpvo.io.run import Run, read_run
 from gpvo.io.source import open_source
@@ -224,7 +224,8 @@ def _print(d: dict[str, Any]) -> None:
         for line in (f"  {found['headline']}", *(f"    {text}" for text in found["lines"])):
             say(line)
     if d["truth_moves_at_rest"]:
-        say(f"  {d['truth_moves_at_rest']} motions are not scored: the truth moves while the vehicle rests, or jumps")
+        at_rest = counted(d["truth_moves_at_rest"], "motion")
+        say(f"  not scored: {at_rest}; the truth moves while the vehicle rests, or jumps")
     for text in d["odd_stretches"]:
         say(f"  {text}: odometry or truth is wrong there")
     errors = [(name, r["translation_m"], r["rotation_rad"]["rmse"]) for name, r in d["rpe"].items()]

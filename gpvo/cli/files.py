@@ -17,7 +17,7 @@ from gpvo.cli.output import time_offset as read_offset
 from gpvo.dataset.clock import estimate_time_offset
 from gpvo.dataset.errors import interpolate_truth
 from gpvo.dataset.hand_eye import FixedTransform, align_frames
-from gpvo.errors import GpvoError, SourceError
+from gpvo.errors import GpvoError, SourceError, counted
 from gpvo.files import plain
 from gpvo.io.foreign import COVARIANCE_AXES, T_FLU_OPTICAL, ForeignLog, check_same_rows, read_foreign
 from gpvo.io.foreign_csv import NO_HEADER
@@ -48,7 +48,7 @@ class ImportSummary:
     worlds_deg: float | None = None
 
     def __str__(self) -> str:
-        parts = [f"{self.frames} records", f"{self.with_truth} with truth"]
+        parts = [counted(self.frames, "record"), f"{self.with_truth} with truth"]
         if self.methods:
             parts.append(f"covariances: {', '.join(self.methods)}")
         if self.time_offset_s:

@@ -14,7 +14,7 @@ from gpvo.cli.common import is_given, refuse_twice
 from gpvo.cli.output import Json, cell, note, print_json, progress, say, show, status, time_offset
 from gpvo.cli.twin import TwinOptions, Twins, in_place_of_runs_without_truth
 from gpvo.dataset.errors import made_from_odometry, motion_errors, outweighed_by_truth
-from gpvo.errors import GpvoError
+from gpvo.errors import GpvoError, counted
 from gpvo.files import refuse_folder
 from gpvo.io.run import read_run
 from gpvo.io.run_read import read_meta
@@ -101,7 +101,7 @@ def train(
         kept = sum(len(s) for s in trained.sets)
         given = trained.header.get("rows", {}).get("given", kept)
         streamed = f", sampled from {given}" if given > kept else ""
-        print(f"{out}: {kept} rows of {len(trained.sets)} run{'s' * (len(trained.sets) != 1)}{streamed}")
+        print(f"{out}: {kept} rows of {counted(len(trained.sets), 'run')}{streamed}")
 
 
 def _tell(trained: TrainedModel, settings: dict[str, Any], noisy: list[str]) -> None:

@@ -12,7 +12,7 @@ import typer
 from gpvo.cli import common as flags
 from gpvo.cli.files import import_log
 from gpvo.cli.output import answer, one_of, print_json, say
-from gpvo.errors import GpvoError, printable
+from gpvo.errors import GpvoError, counted, printable
 from gpvo.io.foreign import COVARIANCE_AXES, ForeignLog, read_foreign
 from gpvo.io.run import read_run
 from gpvo.live import POSE_TYPE_NAMES, LiveSettings, WireSettings
@@ -105,7 +105,7 @@ def doctor(
         print_json({"schema": 1, "source": source, "topics": rows})
         return
     for name, findings in found.items():
-        count = f"{len(findings)} fault{'s' * (len(findings) > 1)}" if findings else "nothing"
+        count = counted(len(findings), "fault") if findings else "nothing"
         print(f"{printable(name)}: {count} found")
         for finding in findings:
             for line in str(finding).splitlines():

@@ -8,7 +8,7 @@ from typing import Annotated, Any
 from gpvo.cli.common import refuse_twice
 from gpvo.cli.evaluate import JudgeOptions
 from gpvo.cli.output import Json, answer, cell, progress, say, show
-from gpvo.errors import GpvoError, SourceError
+from gpvo.errors import GpvoError, SourceError, counted
 from gpvo.files import refuse_folder
 
 
@@ -49,7 +49,8 @@ def score(
     if out is not None:
         raise GpvoError("-o has no effect on files", cure="give a folder of methods, or print --json")
     if len(stated) != len(truth):
-        raise GpvoError(f"{len(stated)} files of stated motions and {len(truth)} truths", cure="one --truth per file")
+        what = f"{counted(len(stated), 'file')} of stated motions and {counted(len(truth), 'truth')}"
+        raise GpvoError(what, cure="give one --truth per file")
     with progress("files", 1):
         found = score_files(list(zip(stated, truth)), options)
     answer(json_, found, lambda: _print(found, truth_sigma is None))

@@ -15,7 +15,7 @@ import typer
 from gpvo.cli.common import refuse_idle
 from gpvo.cli.output import Json, answer, note, print_json, progress, say, show, status
 from gpvo.dataset.errors import require_attitude
-from gpvo.errors import GpvoError
+from gpvo.errors import GpvoError, counted
 from gpvo.io.run import Run, read_run
 from gpvo.online.features import AXES
 
@@ -94,7 +94,7 @@ def twin(
             n = settings.replicates
             _print_ratios(real, [made[i : i + n] for i in range(0, len(made), n)], json_)
             return
-    told = f"{out}: {len(made)} twins of {len(runs)} run{'s' * (len(runs) != 1)}"
+    told = f"{out}: {len(made)} twins of {counted(len(runs), 'run')}"
     answer(json_, {"schema": 1, "twins": [str(p) for p in made]}, lambda: print(told))
 
 

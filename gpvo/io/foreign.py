@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from gpvo.errors import SourceError
+from gpvo.errors import SourceError, counted
 from gpvo.geometry import covariance as transport
 from gpvo.geometry import se3
 from gpvo.geometry.covariance import variances
@@ -200,7 +200,7 @@ def _from_table(path: Path, table: Table, covariance_of: str, axes: str, complet
         cov,
         covariance_of,
         {n: c[n][known] for n in (*COUNT_FIELDS, *FLOAT_FIELDS) if n in c},
-        (*notes, *((f"{lost} rows without a pose were left out",) if lost else ()), *_unused(table, cov)),
+        (*notes, *((f"left out: {counted(lost, 'row')} without a pose",) if lost else ()), *_unused(table, cov)),
     )
 
 
@@ -267,7 +267,7 @@ def check_same_rows(truth: ForeignLog, log: ForeignLog) -> None:
     Raises SourceError, naming both counts.
     """
     if truth.is_counted and log.is_counted and len(truth.t_ns) != len(log.t_ns):
-        text = f"holds {len(truth.t_ns)} poses for the {len(log.t_ns)} of {log.path.name}"
+        text = f"holds {counted(len(truth.t_ns), 'pose')} for the {len(log.t_ns)} of {log.path.name}"
         cure = "with --rate-hz both must have a line per frame; else give --times, or TUM files with stamps"
         raise SourceError(text, where=truth.path, cure=cure)
 
@@ -280,7 +280,7 @@ def _read_kitti(path: Path, times: str | Path | None, rate_hz: float | None) -> 
     if times is not None:
         t = read_times(times)
         if len(t) != len(T):
-            raise SourceError(f"holds {len(t)} stamps for the {len(T)} poses of {path.name}", where=times)
+            raise SourceError(f"holds {counted(len(t), 'stamp')} for the {len(T)} poses of {path.name}", where=times)
         check_growing(Path(times), t, list(range(1, len(t) + 1)))
         check_interval(t, times, lambda _: "the file of --times holds seconds", is_stated=True)
     elif rate_hz is not None:

@@ -11,7 +11,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from gpvo.errors import SourceError
+from gpvo.errors import SourceError, counted
 from gpvo.io.stamps import (
     UNITS_NS,
     check_interval,
@@ -111,10 +111,9 @@ def read_table(path: Path, mapping: Mapping[str, str]) -> Table:
         if len(rows) >= _MAX_ROWS:
             raise SourceError(f"has more than {_MAX_ROWS} rows", where=path)
         if len(fields) < len(header) or any(fields[len(header) :]):  # empty: VINS ends its lines with a comma
-            cure = "name every column, and write numbers with a decimal point"
-            if len(fields) < len(header):
-                cure = cure_of_end(path, number) if rows else None
-            what = f"line {number} holds {len(fields)} fields, the header {len(header)}"
+            too_long = "name every column, and write numbers with a decimal point"
+            cure = too_long if len(fields) >= len(header) else cure_of_end(path, number) if rows else None
+            what = f"line {number} holds {counted(len(fields), 'field')}, the header {len(header)}"
             raise SourceError(what, where=path, cure=cure)
         text = fields[targets[stamp]]
         try:

@@ -13,7 +13,7 @@ from typing import Any, TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
-from gpvo.errors import CalibrationError, SourceError, printable
+from gpvo.errors import CalibrationError, SourceError, counted, printable
 from gpvo.files import read_json, read_toml
 from gpvo.geometry.covariance import LARGEST, are_semidefinite, variances
 from gpvo.io import run_table
@@ -66,9 +66,9 @@ class Run:
         return stored.only(self.log.t_ns[stored.rows_of(self.log) >= 0].tolist())
 
     def __str__(self) -> str:
-        parts = [f"{len(self.log)} records"]
+        parts = [counted(len(self.log), "record")]
         parts += [word for word, has in (("truth", self.truth), ("imu", self.imu)) if has is not None]
-        parts += [f"{len(self.predictions)} predictions"] if self.predictions else []
+        parts += [counted(len(self.predictions), "prediction")] if self.predictions else []
         return f"{self.name}: {', '.join(parts)}"
 
 

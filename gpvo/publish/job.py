@@ -12,7 +12,7 @@ import numpy as np
 
 from gpvo.dataset.build import predictions_of
 from gpvo.dataset.check import warn_of_misfits
-from gpvo.errors import GpvoError
+from gpvo.errors import GpvoError, counted
 from gpvo.files import refuse_foreign, write_text
 from gpvo.io.run import Run, read_run
 from gpvo.io.stamps import END_OF_ROS_NS
@@ -47,8 +47,8 @@ class Published:
         return {"schema": 1, **told, "checks": [v.document() for v in self.verdicts]}
 
     def __str__(self) -> str:
-        written = f"{self.out}: {self.messages} messages" if self.out else f"{self.run}: nothing written"
-        head = f"{written}, covariance from {self.source}, {self.lost} lost frames"
+        written = f"{self.out}: {counted(self.messages, 'message')}" if self.out else f"{self.run}: nothing written"
+        head = f"{written}, covariance from {self.source}, {counted(self.lost, 'lost frame')}"
         if self.outside:
             head += f", {self.outside} far outside the model's domain (MAVLink quality -1: ArduPilot refuses them)"
         return "\n".join([head, *(f"{self.consumer} {v}" for v in self.verdicts)])

@@ -16,6 +16,7 @@ import pytest
 import typer.main
 from gpvo.cli import app
 from gpvo.cli.common import with_common_options
+from gpvo.errors import counted
 from gpvo.io.run import write_run
 from synthetic_runs import make_run
 from typer.testing import CliRunner
@@ -308,3 +309,10 @@ app({words!r})
 """
     done = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True, timeout=120)
     assert done.stdout == "True\n", done.stderr
+
+
+def test_one_of_anything_is_not_a_plural(tmp_path: Path):
+    assert [counted(n, "window") for n in (0, 1, 2)] == ["0 windows", "1 window", "2 windows"]
+    (tmp_path / "log.tum").write_text("1.0 0 0 0 0 0 0 1\n")
+    done = gpvo("import", str(tmp_path / "log.tum"), "-o", str(tmp_path / "run"))
+    assert done.stdout == f"{tmp_path / 'run'}: 1 record, 0 with truth\n"

@@ -159,7 +159,7 @@ def test_what_stands_for_no_number_costs_its_row_alone(word: str, tmp_path: Path
     path.write_text(f"{HEAD}\n0.0,{POSE}\n0.1,0,{word},0,0,0,0,1\n0.2,{POSE}\n")
     log = read_foreign(path)
     np.testing.assert_array_equal(log.t_ns, [0, 200_000_000])
-    assert log.notes == ("1 rows without a pose were left out",)
+    assert log.notes == ("left out: 1 row without a pose",)
 
 
 @pytest.mark.parametrize(
