@@ -7,7 +7,6 @@ from functools import partial
 from pathlib import Path
 from typing import Annotated, Any
 
-import numpy as np
 import typer
 
 from gpvo.cli import common as options
@@ -19,7 +18,7 @@ from gpvo.dataset.errors import interpolate_truth
 from gpvo.dataset.hand_eye import FixedTransform, align_frames
 from gpvo.errors import GpvoError, SourceError, counted
 from gpvo.files import plain
-from gpvo.io.foreign import COVARIANCE_AXES, T_FLU_OPTICAL, ForeignLog, check_same_rows, read_foreign
+from gpvo.io.foreign import COVARIANCE_AXES, PLACES, T_FLU_OPTICAL, ForeignLog, check_same_rows, read_foreign
 from gpvo.io.foreign_csv import NO_HEADER
 from gpvo.io.run import Run, copy_run, read_run, write_run
 from gpvo.io.run_read import is_run
@@ -76,7 +75,7 @@ def import_log(
 ) -> ImportSummary:
     """Make a run folder from another odometry's log, with ground truth of the same frame.
 
-    ``frame``: whose poses these are, ``cam``, ``body``, or ``auto`` for the log's own
+    ``frame``: whose poses these are, of :data:`~gpvo.io.foreign.PLACES`, or ``auto`` for the log's own
     :attr:`~gpvo.io.foreign.ForeignLog.frame`, with a note where it is a bag. ``align``: the fixed transform to fit
     between log and truth, ``rotation``, ``transform`` or ``none``. ``time_offset_s``: to add to the log's stamps, None
     to estimate it. ``truth_sigma``: noise of the truth per pose [m, rad]. ``vehicle``: the bounds by which slips are
@@ -84,7 +83,7 @@ def import_log(
     file, the place and the cure.
     """
     frame = _frame(log) if frame == "auto" else frame
-    place = T_FLU_OPTICAL if frame == "body" else np.eye(4)
+    place = PLACES[frame]
     log, given = log.seen_from(place), None
     if truth is not None:
         check_same_rows(truth, log)
@@ -109,7 +108,7 @@ def import_log(
         VoLog(records),
         overwrite=overwrite,
         truth=given,
-        mounting=Mounting(T_body_cam=T_FLU_OPTICAL if frame == "body" else None),
+        mounting=Mounting(T_body_cam=None if frame == "cam" else T_FLU_OPTICAL),
         config={"import": {"frame": frame, "align": align, "time_offset_s": time_offset_s}},
         meta=meta | {"notes": notes, "vehicle": asdict(vehicle or Vehicle())},
     )
@@ -213,8 +212,8 @@ def import_(
     rate_hz: Annotated[float | None, "Frame rate, for KITTI poses without stamps."] = None,
     frame: Annotated[
         str,
-        "Frame of the poses: cam (left optical frame), body (FLU), or auto: body for a bag, unless its frame "
-        "name contains optical; cam for a file.",
+        "Frame of the poses: cam (left optical frame), body (FLU), frd (a body, y right, z down, as PX4 logs it), or "
+        "auto: body for a bag, unless its frame name contains optical; cam for a file.",
     ] = "auto",
     align: Annotated[
         str,
@@ -240,7 +239,7 @@ def import_(
         sigma = (translation, rotation)
     one_of("--covariance-of", covariance_of, ("pose", "motion"))
     one_of("--covariance-axes", covariance_axes, COVARIANCE_AXES)
-    one_of("--frame", frame, ("auto", "cam", "body"))
+    one_of("--frame", frame, ("auto", *PLACES))
     one_of("--align", align, ("none", "rotation", "transform"))
     mapping, truth_mapping = _mapping("--map", map_ or []), _mapping("--truth-map", truth_map or [])
     stated: dict[str, Any] = {"covariance_of": covariance_of, "covariance_axes": covariance_axes}

@@ -28,6 +28,12 @@ FORMATS = ("tum", "kitti", "csv", "bag")
 COVARIANCE_AXES = ("auto", "world", "body", "mixed")
 # FLU body at the camera's own place, looking forward.
 T_FLU_OPTICAL: Array = se3.from_rt(R_FLU_OPTICAL, np.zeros(3))
+PLACES = {
+    "cam": np.eye(4),
+    "body": T_FLU_OPTICAL,
+    "frd": se3.from_rt(se3.R_FRD_FLU, np.zeros(3)) @ T_FLU_OPTICAL,
+}
+"""Where the camera sits on what poses may be of."""
 # What a step adds to a variance, beyond rounding: of the variance, and of the least that is seen.
 _GROWS, _GROWS_SEEN = 1e-6, 1e-3
 _NAMED = 12  # columns in a remark

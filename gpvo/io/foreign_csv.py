@@ -62,7 +62,10 @@ _AXES = {f"{of}{axis}": i + 3 * (of == "r") for of in ("", "p", "t", "r") for i,
 _AXES |= {"roll": 3, "pitch": 4, "yaw": 5, "r": 3, "p": 4}
 _AXIS = "roll|pitch|yaw|[prt]?[xyz]|r|p"
 _COVARIANCE = re.compile(rf"(?:pose_|position_)?(?:cov|covariance)_({_AXIS})_?({_AXIS})")
-_POSED = re.compile(r"(?:.*_)?(p|t|pos|position|translation|q|quat|ori|orientation|rotation)(?:_rs_r|_rs)?_?([xyzw])")
+_POSED = re.compile(
+    r"(?:.*_)?(p|t|pos|position|translation|q|quat|quaternion|ori|orientation|rot|rotation)(?:_rs_r|_rs)?_?([xyzw])"
+)
+_NUMBERED = re.compile(r"(?:.*[_.])?q(?:uat|uaternion)?_?\[?[0-3]\]?", re.IGNORECASE)
 _VARIANCE = re.compile(rf"(?:pose_|position_)?(?:var|variance)_({_AXIS})")
 _LENGTHS_M = {"m": 1.0, "mm": 1e-3, "cm": 1e-2, "km": 1e3, "ft": 0.3048}
 _ANGLES_RAD = {"rad": 1.0, "mrad": 1e-3, "deg": np.pi / 180}
@@ -228,6 +231,9 @@ def _targets(path: Path, header: list[str], mapping: Mapping[str, str]) -> dict[
         cure = f"name it with --map COLUMN={absent[0]}, for ground truth with --truth-map"
         if {"roll", "pitch", "yaw"} <= {_plain(c).removesuffix("_deg").removesuffix("_rad") for c in header}:
             cure = _ANGLES
+        elif len(q := [c for c in header if _NUMBERED.fullmatch(c)]) == 4:
+            named = " ".join(f"--map '{c}={name}'" for c, name in zip(q, ("q_w", "q_x", "q_y", "q_z")))
+            cure = f"numbers do not tell which is w: if the first, as in PX4's logs, give {named}"
         elif absent == list(_POSE[3:]):
             cure += f"; {POSITIONS_ALONE}"
         raise SourceError(text, where=path, cure=cure)

@@ -235,3 +235,30 @@ def test_poses_alone_are_sent_to_import(tmp_path: Path) -> None:
             open_source(path)
         with pytest.raises(SourceError, match="or 'gpvo import' of poses"):
             read_run(path)
+
+
+@pytest.mark.parametrize(
+    "names", ["q0,q1,q2,q3", "q[0],q[1],q[2],q[3]", "pose.quat_0,pose.quat_1,pose.quat_2,pose.quat_3"]
+)
+def test_numbered_quaternions_are_asked_about(names: str, tmp_path: Path) -> None:
+    """PX4 and Hamilton put w first, ROS last: to map the first one to q_x, as was advised, is wrong for PX4."""
+    path = tmp_path / "log.csv"
+    rows = [f"{k * 0.1:.1f},0,0,0,1,0,0,0" for k in range(5)]
+    path.write_text("\n".join([f"t,x,y,z,{names}", *rows]) + "\n")
+    with pytest.raises(SourceError, match="which is w") as raised:
+        read_foreign(path)
+    columns = names.split(",")
+    assert f"'{columns[0]}=q_w'" in str(raised.value)
+    mapping = dict(zip(columns, ("q_w", "q_x", "q_y", "q_z")))
+    np.testing.assert_array_equal(
+        read_foreign(path, mapping=mapping).trajectory.T_world_body[:, :3, :3], [np.eye(3)] * 5
+    )
+
+
+@pytest.mark.parametrize("name", ["Rot {}", "quaternion.{}", "orientation_{}", "pose/quaternion/{}"])
+def test_quaternions_by_their_usual_names(name: str, tmp_path: Path) -> None:
+    path = tmp_path / "log.csv"
+    names = ",".join(name.format(a) for a in "WXYZ")
+    path.write_text("\n".join([f"Time,Pos X,Pos Y,Pos Z,{names}", *(f"{k * 0.1:.1f},1,2,3,1,0,0,0" for k in range(5))]))
+    T = read_foreign(path).trajectory.T_world_body
+    np.testing.assert_array_equal(T[2], [[1, 0, 0, 1], [0, 1, 0, 2], [0, 0, 1, 3], [0, 0, 0, 1]])
