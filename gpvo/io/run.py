@@ -13,7 +13,6 @@ import shutil
 import time
 from collections import Counter, OrderedDict
 from collections.abc import Iterable, Mapping, Sequence
-from contextlib import suppress
 from dataclasses import asdict, dataclass, field, replace
 from datetime import datetime, timezone
 from pathlib import Path
@@ -197,8 +196,7 @@ class RunWriter:
     def _release(self) -> None:
         if self.path != self._target and not (self._chunks / run_folder.STATE).is_file():
             # Where the new run is not whole, the finished one that it was to replace is worth more.
-            with suppress(OSError):
-                run_folder.discard(self.path)
+            run_folder.discard(self.path)
         self._lock.release()
 
     def _write_meta(self, *, complete: bool) -> None:
@@ -282,8 +280,7 @@ def copy_run(
         write_json(new / "run.json", {**run.meta, "name": target.name, **(meta or {}), "digests": digests})
         run_folder.put_in_place(new, target)
     finally:
-        with suppress(OSError):
-            run_folder.discard(new)
+        run_folder.discard(new)
         lock.release()
 
 

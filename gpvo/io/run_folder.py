@@ -94,7 +94,7 @@ def put_in_place(new: Path, target: Path) -> None:
         if old is not new:
             os.replace(target, old)
             os.replace(new, target)
-        discard(old, empty=False)
+        clear(old)
         for other in old.iterdir():
             os.replace(other, target / other.name)
     except OSError as error:
@@ -102,18 +102,19 @@ def put_in_place(new: Path, target: Path) -> None:
     discard(old)
 
 
-def discard(path: Path, *, keep_chunks: bool = False, empty: bool = True) -> None:
-    """Remove a run, whole or not, and no other file; ``empty``: also its folder, if that holds no more.
-
-    Raises OSError where a file of it cannot be removed.
-    """
+def clear(path: Path, *, keep_chunks: bool = False) -> None:
+    """Remove a run, whole or not, and no other file. Raises OSError where that is not possible."""
     if not keep_chunks:
         shutil.rmtree(path / "chunks", ignore_errors=True)
     for file in (*path.glob(".*.part"), *(path / name for name in OWN)):
         file.unlink(missing_ok=True)
-    if empty:
-        with suppress(OSError):
-            path.rmdir()
+
+
+def discard(path: Path) -> None:
+    """The same, with its folder if that holds no more, as far as possible."""
+    with suppress(OSError):
+        clear(path)
+        path.rmdir()
 
 
 def _exchanged(one: Path, other: Path) -> bool:
@@ -130,7 +131,7 @@ def prepare(path: Path, *, keep_chunks: bool) -> None:
         present = {p.name for p in path.iterdir()} - {p.name for p in path.glob(".*.part")}
         if present and "run.json" not in present:
             raise SourceError("holds something that is not a run", where=path, cure="choose an empty folder with -o")
-        discard(path, keep_chunks=keep_chunks, empty=False)
+        clear(path, keep_chunks=keep_chunks)
     except OSError as error:
         raise OutputError(f"cannot be written: {error.strerror}", where=path) from None
 

@@ -134,11 +134,6 @@ def _check_stamps(run: Run, odometry: Sequence[Odometry], settings: PublishSetti
         raise GpvoError(f"has stamps {when}", where=run.path, cure="subtract an offset from the stamps of its source")
 
 
-def _kind(settings: PublishSettings) -> str:
-    assert settings.out is not None
-    return ros.kind_of(settings.out, "mcap" if settings.to == "mcap" else "sqlite3")
-
-
 def _parameters(bag: Path) -> Path:
     return bag.with_name(f"{bag.stem}_robot_localization.yaml")
 
@@ -149,7 +144,7 @@ def _refuse_other(settings: PublishSettings) -> None:
     if settings.to == "mavlink":
         refuse_foreign(settings.out, *mavlink.TLOG)
     else:
-        ros.refuse_other(settings.out, settings.topic, _kind(settings))
+        ros.refuse_other(settings.out, settings.topic, ros.kind_of(settings.out, settings.to))
         refuse_foreign(_parameters(settings.out), *_PARAMETERS)
 
 
@@ -163,7 +158,7 @@ def _write(run: Run, odometry: Sequence[Odometry], settings: PublishSettings) ->
         return str(out), mavlink.write_tlog(out, odometry, system=settings.system)
     if all(o.twist_body is None for o in odometry):
         raise GpvoError("no frame has a motion: nothing to put into a bag", where=run.path)
-    kind = _kind(settings)
+    kind = ros.kind_of(out, settings.to)
     count = ros.write_bag(out, odometry, settings.topic, kind)
     rate_hz = 1.0 / float(np.median(np.diff([o.t_ns for o in odometry])) * 1e-9)
     text = ros.robot_localization_yaml(settings.topic, rate_hz=max(30.0, rate_hz), ros1=kind == "ros1")

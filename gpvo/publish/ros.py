@@ -101,9 +101,9 @@ def join_bags(path: Path, parts: Iterable[Path], topic: str = TOPIC) -> int:
     return _write(path, _raw(parts), topic, kind_of(path))
 
 
-def kind_of(path: Path, otherwise: str = "sqlite3") -> str:
-    """``ros1``, ``mcap`` or ``sqlite3``, as the suffix says, or ``otherwise``."""
-    return {".bag": "ros1", ".mcap": "mcap"}.get(path.suffix.lower(), otherwise)
+def kind_of(path: Path, to: str | None = None) -> str:
+    """``ros1``, ``mcap`` or ``sqlite3``, as the suffix says, or where it says nothing, what is asked for."""
+    return {".bag": "ros1", ".mcap": "mcap"}.get(path.suffix.lower(), "mcap" if to == "mcap" else "sqlite3")
 
 
 def refuse_other(path: Path, topic: str, kind: str) -> None:
