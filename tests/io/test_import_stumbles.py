@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -262,3 +263,21 @@ def test_quaternions_by_their_usual_names(name: str, tmp_path: Path) -> None:
     path.write_text("\n".join([f"Time,Pos X,Pos Y,Pos Z,{names}", *(f"{k * 0.1:.1f},1,2,3,1,0,0,0" for k in range(5))]))
     T = read_foreign(path).trajectory.T_world_body
     np.testing.assert_array_equal(T[2], [[1, 0, 0, 1], [0, 1, 0, 2], [0, 0, 1, 3], [0, 0, 0, 1]])
+
+
+@pytest.mark.parametrize(
+    ("given", "named"),
+    [
+        ({"mapping": {"a": "p_x"}}, "--map"),
+        ({"topic": "/odom"}, "--topic"),
+        ({"covariance_of": "motion"}, "--covariance-of motion"),
+        ({"covariance_axes": "body"}, "--covariance-axes"),
+    ],
+)
+def test_what_a_format_does_not_read_is_refused(given: dict[str, Any], named: str, tmp_path: Path) -> None:
+    """It was ignored: a TUM file has no columns to map, no topic and no covariances."""
+    path = tmp_path / "log.tum"
+    path.write_text("".join(f"{k * 0.1:.1f} 0 0 0 0 0 0 1\n" for k in range(5)))
+    with pytest.raises(SourceError, match=rf"{named} has no effect on this file .tum."):
+        read_foreign(path, **given)
+    assert len(read_foreign(path, covariance_of="pose").t_ns) == 5
