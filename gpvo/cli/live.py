@@ -89,9 +89,7 @@ def doctor(
     if transport is None:
         found = examine_bag(Path(source), topic)
         if truth is not None:
-            if truth_topic is None and truth.exists() and truth.samefile(source):
-                raise GpvoError("which topic of the bag is the ground truth?", cure="name it with --truth-topic")
-            given = read_foreign(truth, topic=truth_topic, complete=True)
+            given = _truth_of(truth, truth_topic, Path(source))
             topics = [t for t in found if t != truth_topic]
             judged = {t: _nees_of_bag(Path(source), t, given, align, covariance_axes) for t in topics}
     else:
@@ -112,6 +110,13 @@ def doctor(
                 say(f"  {line}")
         for line in _lines(judged[name]) if name in judged else ():
             say(f"  {line}")
+
+
+def _truth_of(truth: Path, topic: str | None, bag: Path) -> ForeignLog:
+    """The ground truth of a bag, which may lie in it. GpvoError where its topic there is not named."""
+    if topic is None and truth.exists() and truth.samefile(bag):
+        raise GpvoError("which topic of the bag is the ground truth?", cure="name it with --truth-topic")
+    return read_foreign(truth, topic=topic, complete=True)
 
 
 def _nees_of_bag(bag: Path, topic: str, truth: ForeignLog, align: str, axes: str) -> dict[str, Any]:

@@ -140,12 +140,8 @@ def read_table(path: Path, mapping: Mapping[str, str]) -> Table:
     unused = tuple(c for k, c in enumerate(header) if k not in targets.values() and _UNCERTAIN.search(c))
     columns = {n: data[:, i] * _to_si(header[targets[n]], n) for i, n in enumerate(order)}
     axes = "mixed" if "cov_33" in targets and _plain(header[targets["cov_33"]]) in _OPENVINS else "world"
-    notes = [] if top else [NO_HEADER]
-    if odd := [n for n in columns if n[:2] == "p_" and _to_si(header[targets[n]], n) != 1.0]:
-        unnamed = any(n.startswith("cov_") and not _UNIT.search(header[targets[n]]) for n in columns)
-        named = f"{header[targets[odd[0]]]} is converted to metres"
-        notes += [f"{named}, the covariances, which name no unit, are not"] if unnamed else []
-    return Table(np.array(stamps, dtype=np.int64), columns, numbers, unused, tuple(notes), axes)
+    notes = (*(() if top else (NO_HEADER,)), *_units_apart({n: header[targets[n]] for n in order}))
+    return Table(np.array(stamps, dtype=np.int64), columns, numbers, unused, notes, axes)
 
 
 def _lines(path: Path) -> Iterator[tuple[int, list[str]]]:
@@ -260,6 +256,13 @@ def _to_si(column: str, target: str) -> float:
     if not all(unit[1] in known for known in units):
         return 1.0
     return float(np.prod([known[unit[1]] for known in units]))
+
+
+def _units_apart(named: Mapping[str, str]) -> Iterator[str]:
+    """A remark where positions state a unit that is converted, and covariances none; ``named``: columns by target."""
+    odd = [column for target, column in named.items() if target[:2] == "p_" and _to_si(column, target) != 1.0]
+    if odd and any(target[:4] == "cov_" and not _UNIT.search(column) for target, column in named.items()):
+        yield f"{odd[0]} is converted to metres, the covariances, which name no unit, are not"
 
 
 def _rest_of_seconds(header: list[str], column: str) -> int | None:
