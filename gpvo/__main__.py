@@ -27,6 +27,8 @@ def main() -> None:
     for name in ("stdout", "stderr"):
         if getattr(sys, name) is None:  # whoever started this has closed it
             setattr(sys, name, open(os.devnull, "w"))  # noqa: SIM115
+        elif hasattr(getattr(sys, name), "reconfigure"):  # no file's name is beyond what ASCII, or Windows, can show
+            getattr(sys, name).reconfigure(errors="backslashreplace")
     try:
         from gpvo.parallel import ending_signals
 

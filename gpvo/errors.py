@@ -31,6 +31,11 @@ def printable(text: object) -> str:
     return plain if plain.isprintable() else "".join(c if c.isprintable() else "?" for c in plain)
 
 
+def counted(count: int, noun: str) -> str:
+    """``1 frame``, ``2 frames``: a noun that is regular."""
+    return f"{count} {noun}{'s' * (count != 1)}"
+
+
 class GpvoError(Exception):
     """Bad input, described for the person who can fix it.
 

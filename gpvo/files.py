@@ -109,10 +109,7 @@ def refuse_foreign(path: Path, mark: bytes, what: str) -> None:
         raise OutputError("is a folder", where=path, cure="name a file")
     if path.exists() and not path.is_file():
         raise OutputError("cannot be written: it is a device or a pipe, not a file", where=path)
-    folder = next((p for p in path.parents if p.exists()), path.parent)
-    if not folder.is_dir() or not os.access(folder, os.W_OK | os.X_OK):
-        reason = "may not be written to" if folder.is_dir() else "is no folder"
-        raise OutputError(f"cannot be written: {folder} {reason}", where=path, cure="name a file in a writable folder")
+    refuse_folder(path.parent, path)
     if not mark or not path.is_file():
         return
     try:
@@ -124,6 +121,18 @@ def refuse_foreign(path: Path, mark: bytes, what: str) -> None:
         raise OutputError(f"cannot be read: {error.strerror}", where=path) from None
     if ends.strip() and not re.search(mark, ends, re.DOTALL):
         raise OutputError(f"is another file, not an earlier {what}", where=path, cure="choose another name")
+
+
+def refuse_folder(path: Path | None, file: Path | None = None) -> None:
+    """Raise OutputError, before the work, where nothing, or not the ``file``, can be written into a folder, made if it
+    is missing."""
+    if path is None:
+        return
+    folder = next((p for p in (path, *path.parents) if p.exists()), path)
+    if not folder.is_dir() or not os.access(folder, os.W_OK | os.X_OK):
+        reason = "may not be written to" if folder.is_dir() else "is no folder"
+        cure = "choose a writable folder" if file is None else "name a file in a writable folder"
+        raise OutputError(f"cannot be written: {folder} {reason}", where=file or path, cure=cure)
 
 
 def make_folder(path: Path) -> Path:

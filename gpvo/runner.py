@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from gpvo.errors import GpvoError, SourceError
+from gpvo.errors import GpvoError, SourceError, counted
 from gpvo.files import in_metres, plain, read_toml, write_json
 from gpvo.io.run import RunWriter, as_stored
 from gpvo.io.snapshot import digest_of
@@ -46,7 +46,8 @@ class RunSummary:
     def __str__(self) -> str:
         named = ((s.value, self.status.get(s.value, 0)) for s in Status if s is not Status.START)
         parts = ", ".join(f"{n} {name}" for name, n in named if n)
-        return f"{self.frames} frames ({parts}), {in_metres(self.path_length_m)}, {self.frames_per_s:.0f} frames/s"
+        frames = counted(self.frames, "frame")
+        return f"{frames} ({parts}), {in_metres(self.path_length_m)}, {self.frames_per_s:.0f} frames/s"
 
 
 def run(

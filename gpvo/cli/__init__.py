@@ -105,8 +105,12 @@ def main() -> None:
 def _refuse_control_characters(arguments: list[str]) -> None:
     """File names are echoed to the terminal, which would obey any control characters in them."""
     for argument in arguments:
-        if any(unicodedata.category(c) in ("Cc", "Cs") for c in argument):
+        kinds = {unicodedata.category(c) for c in argument}
+        if "Cc" in kinds:
             raise GpvoError("a control character in an argument", where=argument, cure="rename the file")
+        if "Cs" in kinds:
+            cure = "set PYTHONUTF8=1, or rename the file"
+            raise GpvoError("an argument is not in the encoding of this system", where=argument, cure=cure)
 
 
 def _extra(package: str) -> str:

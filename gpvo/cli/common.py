@@ -48,6 +48,11 @@ class Groups(TyperGroup):
                 formatter.write_dl([(name, (c.help or "").split("\n\n")[0].strip()) for name, c in commands])
 
 
+CovarianceAxes = Annotated[
+    str,
+    "Axes of covariances of poses: world, body, mixed (those of the rotation alone are the body's), or auto: mixed for"
+    " columns of OpenVINS' names, else world.",
+]
 Config = Annotated[Path | None, "TOML file of options, one table per command. The command line takes precedence."]
 Quiet = Annotated[bool, "-q", "--quiet", "No progress and no notes."]
 Verbose = Annotated[bool, "-v", "--verbose", "Also print settings, time and memory."]
@@ -260,6 +265,12 @@ def is_given(ctx: typer.Context, option: str) -> bool:
     """Whether the user gave an option, rather than leaving its default."""
     source = ctx.get_parameter_source(option)
     return source is not None and source.name != "DEFAULT"
+
+
+def refuse_idle(ctx: typer.Context, names: Iterable[str], why: str, cure: str) -> None:
+    """Raise GpvoError for the first of these options that the user gave, though nothing will read it: ``why``."""
+    if idle := [name for name in names if is_given(ctx, name)]:
+        raise GpvoError(f"--{idle[0].strip('_').replace('_', '-')} has no effect {why}", cure=cure)
 
 
 def refuse_twice(paths: Iterable[Path]) -> None:

@@ -14,8 +14,8 @@ import typer
 from gpvo.cli.common import refuse_twice
 from gpvo.cli.output import Json, cell, numbers, print_json, progress, say, show, time_offset
 from gpvo.cli.twin import TWINS, Seed, TwinOptions, make_all, say_simulated
-from gpvo.errors import GpvoError
-from gpvo.files import in_metres, refuse_foreign
+from gpvo.errors import GpvoError, counted
+from gpvo.files import in_metres, refuse_folder, refuse_foreign
 from gpvo.io.run import Run, read_run
 from gpvo.io.source import open_source
 from gpvo.io.trajectory import read_tum
@@ -77,6 +77,8 @@ def evaluate(
     from gpvo.evaluation.document import document, pooled
     from gpvo.evaluation.evaluate import distinct
 
+    for folder in (stated, tables, plots):
+        refuse_folder(folder)
     settings = twin_options.asked(ctx, twins, seed, "seed")
     if settings is not None:
         documents, found = _with_twins(*_loaded(runs, judge), judge.model, judge.options(), settings)
@@ -223,7 +225,8 @@ def _print(d: dict[str, Any]) -> None:
         for line in (f"  {found['headline']}", *(f"    {text}" for text in found["lines"])):
             say(line)
     if d["truth_moves_at_rest"]:
-        say(f"  {d['truth_moves_at_rest']} motions are not scored: the truth moves while the vehicle rests, or jumps")
+        at_rest = counted(d["truth_moves_at_rest"], "motion")
+        say(f"  not scored: {at_rest}; the truth moves while the vehicle rests, or jumps")
     for text in d["odd_stretches"]:
         say(f"  {text}: odometry or truth is wrong there")
     errors = [(name, r["translation_m"], r["rotation_rad"]["rmse"]) for name, r in d["rpe"].items()]

@@ -7,7 +7,7 @@ from functools import partial
 from pathlib import Path
 from typing import Annotated, Any
 
-import numpy as np
+import typer
 
 from gpvo.cli import common as options
 from gpvo.cli.describe import as_lines, describe
@@ -16,9 +16,9 @@ from gpvo.cli.output import time_offset as read_offset
 from gpvo.dataset.clock import estimate_time_offset
 from gpvo.dataset.errors import interpolate_truth
 from gpvo.dataset.hand_eye import FixedTransform, align_frames
-from gpvo.errors import GpvoError, SourceError
+from gpvo.errors import GpvoError, SourceError, counted
 from gpvo.files import plain
-from gpvo.io.foreign import COVARIANCE_AXES, T_FLU_OPTICAL, ForeignLog, check_same_rows, read_foreign
+from gpvo.io.foreign import COVARIANCE_AXES, PLACES, T_FLU_OPTICAL, ForeignLog, check_same_rows, read_foreign
 from gpvo.io.foreign_csv import NO_HEADER
 from gpvo.io.run import Run, copy_run, read_run, write_run
 from gpvo.io.run_read import is_run
@@ -26,6 +26,10 @@ from gpvo.io.stated import to_records
 from gpvo.io.trajectory import check_overlap
 from gpvo.online.slip import flag_slips
 from gpvo.types import Mounting, TruthLog, Vehicle, VoLog
+
+_OF_LOGS = (
+    "format_", "map_", "topic", "frame", "covariance_of", "covariance_axes", "vehicle", "max_acceleration", "max_turn",
+)  # fmt: skip
 
 
 @dataclass(frozen=True)
@@ -43,7 +47,7 @@ class ImportSummary:
     worlds_deg: float | None = None
 
     def __str__(self) -> str:
-        parts = [f"{self.frames} records", f"{self.with_truth} with truth"]
+        parts = [counted(self.frames, "record"), f"{self.with_truth} with truth"]
         if self.methods:
             parts.append(f"covariances: {', '.join(self.methods)}")
         if self.time_offset_s:
@@ -71,7 +75,7 @@ def import_log(
 ) -> ImportSummary:
     """Make a run folder from another odometry's log, with ground truth of the same frame.
 
-    ``frame``: whose poses these are, ``cam``, ``body``, or ``auto`` for the log's own
+    ``frame``: whose poses these are, of :data:`~gpvo.io.foreign.PLACES`, or ``auto`` for the log's own
     :attr:`~gpvo.io.foreign.ForeignLog.frame`, with a note where it is a bag. ``align``: the fixed transform to fit
     between log and truth, ``rotation``, ``transform`` or ``none``. ``time_offset_s``: to add to the log's stamps, None
     to estimate it. ``truth_sigma``: noise of the truth per pose [m, rad]. ``vehicle``: the bounds by which slips are
@@ -79,7 +83,7 @@ def import_log(
     file, the place and the cure.
     """
     frame = _frame(log) if frame == "auto" else frame
-    place = T_FLU_OPTICAL if frame == "body" else np.eye(4)
+    place = PLACES[frame]
     log, given = log.seen_from(place), None
     if truth is not None:
         check_same_rows(truth, log)
@@ -104,7 +108,7 @@ def import_log(
         VoLog(records),
         overwrite=overwrite,
         truth=given,
-        mounting=Mounting(T_body_cam=T_FLU_OPTICAL if frame == "body" else None),
+        mounting=Mounting(T_body_cam=None if frame == "cam" else T_FLU_OPTICAL),
         config={"import": {"frame": frame, "align": align, "time_offset_s": time_offset_s}},
         meta=meta | {"notes": notes, "vehicle": asdict(vehicle or Vehicle())},
     )
@@ -192,6 +196,7 @@ def info(
 
 
 def import_(
+    ctx: typer.Context,
     log: Annotated[Path, "Trajectory, CSV or bag of another odometry; or a run, to give it ground truth."],
     out: Annotated[Path, "Run folder to write."],
     truth: Annotated[Path | None, "Ground truth of the same frame, or see --align: a trajectory, CSV or bag."] = None,
@@ -207,8 +212,8 @@ def import_(
     rate_hz: Annotated[float | None, "Frame rate, for KITTI poses without stamps."] = None,
     frame: Annotated[
         str,
-        "Frame of the poses: cam (left optical frame), body (FLU), or auto: body for a bag, unless its frame "
-        "name contains optical; cam for a file.",
+        "Frame of the poses: cam (left optical frame), body (FLU), frd (a body, y right, z down, as PX4 logs it), or "
+        "auto: body for a bag, unless its frame name contains optical; cam for a file.",
     ] = "auto",
     align: Annotated[
         str,
@@ -218,11 +223,7 @@ def import_(
     time_offset: Annotated[str, "Seconds to add to the stamps of the log, or auto."] = "0",
     truth_sigma: Annotated[str | None, "White noise of the truth per pose, METRES,RADIANS."] = None,
     covariance_of: Annotated[str, "Whether the covariances in a CSV are of poses or motions."] = "pose",
-    covariance_axes: Annotated[
-        str,
-        "Axes of covariances of poses: world, body, mixed (those of the rotation alone are the body's), or auto: mixed "
-        "for columns of OpenVINS' names, else world.",
-    ] = "auto",
+    covariance_axes: options.CovarianceAxes = "auto",
     vehicle: options.VehicleOptions = options.VehicleOptions(),
     overwrite: options.Overwrite = False,
     json_: Json = False,
@@ -238,29 +239,28 @@ def import_(
         sigma = (translation, rotation)
     one_of("--covariance-of", covariance_of, ("pose", "motion"))
     one_of("--covariance-axes", covariance_axes, COVARIANCE_AXES)
-    one_of("--frame", frame, ("auto", "cam", "body"))
+    one_of("--frame", frame, ("auto", *PLACES))
     one_of("--align", align, ("none", "rotation", "transform"))
     mapping, truth_mapping = _mapping("--map", map_ or []), _mapping("--truth-map", truth_map or [])
     stated: dict[str, Any] = {"covariance_of": covariance_of, "covariance_axes": covariance_axes}
     of_truth: dict[str, Any] = {"mapping": truth_mapping, "topic": truth_topic, "complete": True}
     read = partial(read_foreign, times=times, rate_hz=rate_hz)
     fit: dict[str, Any] = {"align": align, "time_offset_s": offset, "truth_sigma": sigma, "overwrite": overwrite}
+    of_run = is_run(log) or log.suffix == ".parquet"  # a run's own table is no log, as reading it as a run says
+    if of_run:  # which knows what it holds, and of which only truth changes
+        cure = "leave it out; --align transform fits a truth of another frame"
+        options.refuse_idle(ctx, _OF_LOGS, f"on a run, as {log} is", cure)
+    if truth is None:
+        idle = ("truth_format", "truth_map", "truth_topic", *(() if of_run else ("align", "truth_sigma")))
+        options.refuse_idle(ctx, idle, "without ground truth", "give it with --truth")
     with progress("logs", 1):
         given = None if truth is None else read(truth, truth_format, **of_truth)
-        if is_run(log) or log.suffix == ".parquet":  # a run's own table is no log, as reading it as a run says
-            _refuse_of_a_run(log, {"frame": frame != "auto", "format": format_, "map": map_, "topic": topic})
+        if of_run:
             summary = add_truth(read_run(log), given, out, **fit)
         else:
             foreign = read(log, format_, mapping=mapping, topic=topic, **stated)
             summary = import_log(foreign, given, out, frame=frame, vehicle=vehicle.bounds(), **fit)
     answer(json_, {"schema": 1, "run": str(out), **vars(summary)}, lambda: print(f"{out}: {summary}"))
-
-
-def _refuse_of_a_run(run: Path, given: dict[str, Any]) -> None:
-    """Refuse what says how a file is read: a run knows, and its poses are those of its left camera."""
-    if names := [name for name, value in given.items() if value]:
-        cure = "leave it out; --align transform fits a truth of another frame"
-        raise SourceError(f"--{names[0]} has no effect on a run", where=run, cure=cure)
 
 
 def _mapping(option: str, texts: list[str]) -> dict[str, str]:

@@ -12,6 +12,7 @@ import typer
 from gpvo.cli.common import refuse_twice
 from gpvo.cli.output import Json, answer, one_of, print_json, progress, say, status
 from gpvo.cli.twin import Seed, TwinOptions, Twins, in_place_of_runs_without_truth, say_simulated
+from gpvo.files import refuse_folder
 from gpvo.publish import PublishSettings
 
 
@@ -37,13 +38,15 @@ def fuse(
 
     Example: gpvo fuse runs/flight7 --model models/tunnel.gpvo --plot fuse.png
     """
-    from gpvo.evaluation.fusion import FusionSettings, document, fuse_runs, write_log
-    from gpvo.filters.measurement import Gate
-    from gpvo.filters.policies import LEARNED
-    from gpvo.filters.run import FuseOptions
-    from gpvo.filters.study import table
+    with status("starting"):
+        from gpvo.evaluation.fusion import FusionSettings, document, fuse_runs, write_log
+        from gpvo.filters.measurement import Gate
+        from gpvo.filters.policies import LEARNED
+        from gpvo.filters.run import FuseOptions
+        from gpvo.filters.study import table
 
     refuse_twice(runs)
+    refuse_folder(log)
     judging = twin_options.asked(ctx, twins, seed, "seed")
     one_of("--init", init, ("truth", "static"))
     one_of("--gate", gate, ("discard", "inflate"))

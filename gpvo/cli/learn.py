@@ -11,11 +11,12 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from gpvo.cli.common import is_given, refuse_twice
-from gpvo.cli.output import Json, cell, note, print_json, progress, say, show, time_offset
+from gpvo.cli.output import Json, cell, note, print_json, progress, say, show, status, time_offset
 from gpvo.cli.twin import TwinOptions, Twins, in_place_of_runs_without_truth
 from gpvo.dataset.errors import motion_errors
 from gpvo.dataset.truth_noise import made_from_odometry
-from gpvo.errors import GpvoError
+from gpvo.errors import GpvoError, counted
+from gpvo.files import refuse_folder
 from gpvo.io.run import read_run
 from gpvo.io.run_read import read_meta
 
@@ -72,7 +73,8 @@ def train(
 
     Example: gpvo train runs/a runs/b runs/c -o errors.gpvo
     """
-    from gpvo.learning.store import config_of, folds_path, refuse_foreign_model, save_model
+    with status("starting"):
+        from gpvo.learning.store import config_of, folds_path, refuse_foreign_model, save_model
 
     refuse_foreign_model(out)
     settings = asdict(options) | {"time_offset_s": time_offset(options.time_offset_s)}
@@ -80,6 +82,7 @@ def train(
         settings = asdict(config_of(update)) | {k: v for k, v in settings.items() if is_given(ctx, k)}
     settings |= {"jobs": jobs, "backend": backend, "scheduler": scheduler}
     settings["keep"] = str(folds_path(out)) if backend == "local" else None
+    refuse_folder(statements)
     if statements is not None:
         _check_statements(runs, settings, update)
     drawn = twin_options.asked(ctx, twins, options.seed)
@@ -98,7 +101,7 @@ def train(
         kept = sum(len(s) for s in trained.sets)
         given = trained.header.get("rows", {}).get("given", kept)
         streamed = f", sampled from {given}" if given > kept else ""
-        print(f"{out}: {kept} rows of {len(trained.sets)} run{'s' * (len(trained.sets) != 1)}{streamed}")
+        print(f"{out}: {kept} rows of {counted(len(trained.sets), 'run')}{streamed}")
 
 
 def _tell(trained: TrainedModel, settings: dict[str, Any]) -> None:

@@ -7,11 +7,13 @@ from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import TYPE_CHECKING, Annotated, Any
 
+import typer
+
 from gpvo.cli import common as flags
 from gpvo.cli.files import import_log
 from gpvo.cli.output import answer, one_of, print_json, say
-from gpvo.errors import GpvoError, printable
-from gpvo.io.foreign import ForeignLog, read_foreign
+from gpvo.errors import GpvoError, counted, printable
+from gpvo.io.foreign import COVARIANCE_AXES, ForeignLog, read_foreign
 from gpvo.io.run import read_run
 from gpvo.live import POSE_TYPE_NAMES, LiveSettings, WireSettings
 from gpvo.types import IMPORTED, Vehicle
@@ -36,6 +38,7 @@ def live(
 
     one_of("--odometry-type", asked.odometry_type, POSE_TYPE_NAMES)
     carrier = vehicle.bounds()
+    one_of("--covariance-axes", asked.covariance_axes, COVARIANCE_AXES)
     one_of("--pose-covariance", asked.pose_covariance, ("accumulated", "increment"))
     stereo = _stereo_settings(vo, carrier, asked.stereo is not None, view.given())
     one_of("--truth-type", asked.truth_type, POSE_TYPE_NAMES)
@@ -56,11 +59,13 @@ def _stereo_settings(
 
 
 def doctor(
+    ctx: typer.Context,
     source: Annotated[str, "A bag, or a topic of a running system.", {"metavar": "TOPIC|BAG"}],
     topic: Annotated[str | None, "Topic in a bag; default: all that hold poses."] = None,
     truth: Annotated[Path | None, "Ground truth of the same body, a file or a bag: adds the NEES (bags only)."] = None,
     truth_topic: Annotated[str | None, "Topic of the ground truth in a bag."] = None,
     align: Annotated[str, "Fit a fixed transform between bag and truth, as gpvo import does."] = "none",
+    covariance_axes: flags.CovarianceAxes = "auto",
     wire: WireSettings = WireSettings(),
     odometry_type: Annotated[str, "Type of a topic: odometry, pose, or pose_stamped."] = "odometry",
     seconds: Annotated[float, "How long to listen.", {"min": 1.0}] = 10.0,
@@ -74,6 +79,9 @@ def doctor(
 
     transport = wire.transport()
     one_of("--align", align, ("none", "rotation", "transform"))
+    one_of("--covariance-axes", covariance_axes, COVARIANCE_AXES)
+    if truth is None:
+        flags.refuse_idle(ctx, ("truth_topic", "align", "covariance_axes"), "without ground truth", "add --truth")
     if truth is not None and transport is not None:
         cure = "record it first, or use gpvo live --truth TOPIC"
         raise GpvoError("--truth judges a bag, not a running topic", cure=cure)
@@ -81,10 +89,9 @@ def doctor(
     if transport is None:
         found = examine_bag(Path(source), topic)
         if truth is not None:
-            if truth_topic is None and truth.exists() and truth.samefile(source):
-                raise GpvoError("which topic of the bag is the ground truth?", cure="name it with --truth-topic")
-            given = read_foreign(truth, topic=truth_topic, complete=True)
-            judged = {t: _nees_of_bag(Path(source), t, given, align) for t in found if t != truth_topic}
+            given = _truth_of(truth, truth_topic, Path(source))
+            topics = [t for t in found if t != truth_topic]
+            judged = {t: _nees_of_bag(Path(source), t, given, align, covariance_axes) for t in topics}
     else:
         kind = POSE_TYPE_NAMES[one_of("--odometry-type", odometry_type, POSE_TYPE_NAMES)]
         found = {source: examine_topic(transport, source, kind, seconds, wire.address, wire.domain)}
@@ -96,7 +103,7 @@ def doctor(
         print_json({"schema": 1, "source": source, "topics": rows})
         return
     for name, findings in found.items():
-        count = f"{len(findings)} fault{'s' * (len(findings) > 1)}" if findings else "nothing"
+        count = counted(len(findings), "fault") if findings else "nothing"
         print(f"{printable(name)}: {count} found")
         for finding in findings:
             for line in str(finding).splitlines():
@@ -105,7 +112,14 @@ def doctor(
             say(f"  {line}")
 
 
-def _nees_of_bag(bag: Path, topic: str, truth: ForeignLog, align: str) -> dict[str, Any]:
+def _truth_of(truth: Path, topic: str | None, bag: Path) -> ForeignLog:
+    """The ground truth of a bag, which may lie in it. GpvoError where its topic there is not named."""
+    if topic is None and truth.exists() and truth.samefile(bag):
+        raise GpvoError("which topic of the bag is the ground truth?", cure="name it with --truth-topic")
+    return read_foreign(truth, topic=topic, complete=True)
+
+
+def _nees_of_bag(bag: Path, topic: str, truth: ForeignLog, align: str, axes: str) -> dict[str, Any]:
     """NEES per degree of freedom of the ``poses`` and of the ``motions`` whose covariances a topic states: None, or by
     block of the error {``nees_dof``, ``interval``, ``median``} with the ``count``; and the ``problem`` where nothing
     could be judged. ``truth``: of the same body."""
@@ -114,7 +128,7 @@ def _nees_of_bag(bag: Path, topic: str, truth: ForeignLog, align: str) -> dict[s
 
     try:
         with TemporaryDirectory(prefix="gpvo-") as folder:
-            log = read_foreign(bag, topic=topic)
+            log = read_foreign(bag, topic=topic, covariance_axes=axes)
             import_log(log, truth, Path(folder) / "run", frame=log.frame, align=align)
             evaluation = evaluate_run(read_run(Path(folder) / "run"))
     except GpvoError as error:

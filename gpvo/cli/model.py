@@ -11,7 +11,7 @@ import numpy as np
 import typer
 
 from gpvo.cli.output import Json, answer, print_json, progress, say, show
-from gpvo.errors import GpvoError
+from gpvo.errors import GpvoError, counted
 from gpvo.files import refuse_foreign, write_csv
 from gpvo.io.parquet import write_table
 from gpvo.io.run import PREDICTIONS, read_run, write_predictions
@@ -63,7 +63,7 @@ def predict(
     per = "per motion" if predictor.target == "frame" else f"over {predictor.target}"
     for d in documents:
         inside = 100 * (d["in_domain"] or 0)
-        print(f"{d['file']}: {d['predictions']} predictions, {inside:.0f} % inside the training domain")
+        print(f"{d['file']}: {counted(d['predictions'], 'prediction')}, {inside:.0f} % inside the training domain")
         length, angle = (1e3 * sum(x**2 for x in sigma) ** 0.5 for sigma in d["median_sigma"].values())
         known = f"median sigma: {length:.3g} mm, {angle:.3g} mrad {per}"
         print("no motion was measured" if d["in_domain"] is None else known)
@@ -204,8 +204,8 @@ def _rows(f: Forecast) -> list[dict[str, float]]:
 
 
 def _print_forecast(f: Forecast, path: Path) -> None:
-    p = f.plan
-    say(f"{path}: {p.t_s[-1]:.1f} s, {p.distance_m[-1]:.1f} m, {len(p.t_s) - 1} motions at {1 / p.step_s:.3g} Hz")
+    p, motions = f.plan, counted(len(f.plan.t_s) - 1, "motion")
+    say(f"{path}: {p.t_s[-1]:.1f} s, {p.distance_m[-1]:.1f} m, {motions} at {1 / p.step_s:.3g} Hz")
     say(f"{100 * f.outside_share:.3g} % of the plan lies outside the training domain")
     for o in f.outside:
         a, b = o.planned, o.trained

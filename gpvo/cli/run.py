@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Annotated
 
 from gpvo.cli import common as flags
 from gpvo.cli.output import Json, note, print_json, progress
-from gpvo.errors import SourceError
+from gpvo.errors import SourceError, counted
 from gpvo.files import read_json, write_text
 from gpvo.io.run import read_run
 from gpvo.io.source import open_source
@@ -86,7 +86,7 @@ def _tell(out: Path, summary: RunSummary, notes: Sequence[str], json_: bool) -> 
         print_json({"schema": 1, "run": str(out), **summary.__dict__})
     else:
         print(f"{out}: {summary}")
-        if summary.source_report != f"{summary.frames} frames":
+        if summary.source_report != counted(summary.frames, "frame"):
             print(f"source: {summary.source_report}")
         for line in summary.calibration:
             print(f"calibration: {line}")

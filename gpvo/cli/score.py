@@ -8,7 +8,8 @@ from typing import Annotated, Any
 from gpvo.cli.common import refuse_twice
 from gpvo.cli.evaluate import JudgeOptions
 from gpvo.cli.output import Json, answer, cell, progress, say, show
-from gpvo.errors import GpvoError, SourceError
+from gpvo.errors import GpvoError, SourceError, counted
+from gpvo.files import refuse_folder
 
 
 def score(
@@ -34,6 +35,7 @@ def score(
     from gpvo.evaluation.score import score_folder, write_board
 
     refuse_twice(stated)
+    refuse_folder(out)
     truth = truth or []
     if missing := [path for path in (*stated, *truth) if not path.exists()]:
         raise SourceError("no such file or folder", where=missing[0])
@@ -46,8 +48,11 @@ def score(
         document = {"schema": 1, "methods": list(methods.values())}
         answer(json_, document, lambda: _print_board(methods, truth_sigma is None))
         return
+    if out is not None:
+        raise GpvoError("-o has no effect on files", cure="give a folder of methods, or print --json")
     if len(stated) != len(truth):
-        raise GpvoError(f"{len(stated)} files of stated motions and {len(truth)} truths", cure="one --truth per file")
+        what = f"{counted(len(stated), 'file')} of stated motions and {counted(len(truth), 'truth')}"
+        raise GpvoError(what, cure="give one --truth per file")
     with progress("files", 1):
         found = score_files(list(zip(stated, truth)), options)
     answer(json_, found, lambda: _print(found, truth_sigma is None))

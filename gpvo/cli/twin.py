@@ -12,10 +12,10 @@ from typing import TYPE_CHECKING, Annotated, Any
 import numpy as np
 import typer
 
-from gpvo.cli.common import is_given
-from gpvo.cli.output import Json, answer, note, print_json, progress, say, show
+from gpvo.cli.common import refuse_idle
+from gpvo.cli.output import Json, answer, note, print_json, progress, say, show, status
 from gpvo.dataset.errors import require_attitude
-from gpvo.errors import GpvoError
+from gpvo.errors import GpvoError, counted
 from gpvo.io.run import Run, read_run
 from gpvo.online.features import AXES
 
@@ -39,8 +39,9 @@ class TwinOptions:
 
     def settings(self, seed: int) -> TwinSettings:
         """The flags, parsed. Raises GpvoError for an unknown tolerance or a file without a gap."""
-        from gpvo.twin.gap import read_gap
-        from gpvo.twin.replicate import TwinSettings, read_tolerance
+        with status("starting"):
+            from gpvo.twin.gap import read_gap
+            from gpvo.twin.replicate import TwinSettings, read_tolerance
 
         name, sigma = read_tolerance(self.tolerance)
         return TwinSettings(self.replicates, sigma, name, seed, None if self.gap is None else read_gap(self.gap))
@@ -52,8 +53,7 @@ class TwinOptions:
         """
         if twins:
             return self.settings(seed)
-        if idle := [name for name in (*(f.name for f in fields(self)), *others) if is_given(ctx, name)]:
-            raise GpvoError(f"--{idle[0]} has no effect without --twins", cure="add --twins")
+        refuse_idle(ctx, (*(f.name for f in fields(self)), *others), "without --twins", "add --twins")
         return None
 
 
@@ -94,7 +94,7 @@ def twin(
             n = settings.replicates
             _print_ratios(real, [made[i : i + n] for i in range(0, len(made), n)], json_)
             return
-    told = f"{out}: {len(made)} twins of {len(runs)} run{'s' * (len(runs) != 1)}"
+    told = f"{out}: {len(made)} twins of {counted(len(runs), 'run')}"
     answer(json_, {"schema": 1, "twins": [str(p) for p in made]}, lambda: print(told))
 
 

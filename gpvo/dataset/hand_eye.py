@@ -17,7 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from gpvo.dataset.errors import interpolate_truth
-from gpvo.errors import GpvoError
+from gpvo.errors import GpvoError, counted
 from gpvo.geometry import se3
 from gpvo.types import Array, TruthLog, VoLog
 
@@ -106,7 +106,7 @@ def fit_fixed_transform(
     """
     if len(A) < MIN_MOTIONS:
         raise GpvoError(
-            f"only {len(A)} windows of {WINDOW_S:g} s have truth at both ends and no lost frame, too few to align",
+            f"too few to align: {counted(len(A), 'window')} of {WINDOW_S:g} s with truth at both ends, none lost",
             cure="give a longer log, check the stamps, or leave --align out",
         )
     X, R, scale = _start(A, B), np.eye(3), np.array([1.0, 1.0])

@@ -10,7 +10,7 @@ from itertools import accumulate, permutations, product
 
 import numpy as np
 
-from gpvo.errors import GpvoError
+from gpvo.errors import GpvoError, counted
 from gpvo.filters.imu_motion import (
     MIN_ROTATION_RAD,
     MIN_ROTATIONS,
@@ -77,7 +77,7 @@ def require_sane(flight: Flight) -> list[Finding]:
 
 def _clocks(flight: Flight, imu: ImuLog) -> Iterator[Finding]:
     if len(imu.t_ns) < 2:
-        yield Finding("imu", f"the IMU log holds {len(imu.t_ns)} samples", "run without it: --no-imu")
+        yield Finding("imu", f"the IMU log holds {counted(len(imu.t_ns), 'sample')}", "run without it: --no-imu")
         return
     first, last = flight.records[0].t_ns, flight.records[-1].t_ns
     on_clock = imu.t_ns[on_one_clock(imu.t_ns, np.ones(len(imu.t_ns), bool))]
@@ -101,8 +101,8 @@ def _clocks(flight: Flight, imu: ImuLog) -> Iterator[Finding]:
         usual = float(np.median(forward)) * 1e-9
         gaps = forward[forward * 1e-9 > max(5 * usual, 0.05)] * 1e-9
         if len(gaps):
-            text = f"{len(gaps)} gaps in the IMU, the longest {gaps.max():.2f} s where {usual * 1e3:.1f} ms is usual"
-            yield Finding("gap", text, fatal=False)
+            text = f"{counted(len(gaps), 'gap')} in the IMU, the longest {gaps.max():.2f} s"
+            yield Finding("gap", f"{text} where {usual * 1e3:.1f} ms is usual", fatal=False)
 
 
 def _samples(imu: ImuLog) -> Iterator[Finding]:
@@ -113,7 +113,7 @@ def _samples(imu: ImuLog) -> Iterator[Finding]:
         yield Finding("imu", text, "run without it: --no-imu" if every else "", fatal=every)
     beyond = int((~bad & ~usable(imu)).sum())
     if 0 < beyond <= 0.5 * len(imu.t_ns):  # More than that are in another unit.
-        text = f"{beyond} of {len(imu.t_ns)} IMU samples are out of range or out of order and count as missing"
+        text = f"IMU samples out of range or out of order, counted as missing: {beyond} of {len(imu.t_ns)}"
         yield Finding("imu", text, fatal=False)
 
 

@@ -190,7 +190,7 @@ def read_poses(
     t = np.array([stamp_ns(m) for m in kept], dtype=np.int64)
     wrong = astray(t)
     if wrong.any():
-        remark(f"{int(wrong.sum())} of {len(t)} messages on '{topic}' are stamped seconds off and were left out")
+        remark(f"left out: {int(wrong.sum())} of {len(t)} messages on '{topic}', stamped seconds off")
     t, kept = t[~wrong], list(compress(kept, ~wrong))
     data = np.array([pose_of(m) for m in kept])
     order = _in_time(t, data, topic, path, remark)
@@ -198,7 +198,7 @@ def read_poses(
     if bad := int((~good).sum()):
         if complete or bad == len(order):
             raise SourceError(f"message {order[~good][0] + 1} on '{topic}' holds no valid pose", where=path)
-        remark(f"{bad} of {len(t)} messages on '{topic}' hold no valid pose and were left out")
+        remark(f"left out: {bad} of {len(t)} messages on '{topic}', without a valid pose")
     order = order[good]
     t, data = t[order], data[order]
     return t, se3.from_quaternion(data[:, :3], data[:, 3:]), [kept[i] for i in order]
@@ -210,7 +210,7 @@ def _of_one_odometry(given: list[Any], topic: str, path: Path, remark: Callable[
     if not kept or min(map(stamp_ns, kept)) < BACK_NS:  # on a clock that starts there, zero is a stamp
         kept = given
     if unset := len(given) - len(kept):
-        remark(f"{unset} of {len(given)} messages on '{topic}' carry no stamp and were left out")
+        remark(f"left out: {unset} of {len(given)} messages on '{topic}', without a stamp")
     frames = [(str(m.header.frame_id), str(getattr(m, "child_frame_id", ""))) for m in kept]
     (most, count), *others = Counter(frames).most_common()
     if count < _LEAST_LEFT * len(kept):
@@ -218,7 +218,7 @@ def _of_one_odometry(given: list[Any], topic: str, path: Path, remark: Callable[
         cure = "one topic must be one odometry's: record its publishers apart, or split the bag where the frames change"
         raise SourceError(f"poses of different frames are mixed on '{topic}': {a}, and {b}", where=path, cure=cure)
     if others:
-        remark(f"{len(kept) - count} of {len(kept)} messages on '{topic}' are of other frames and were left out")
+        remark(f"left out: {len(kept) - count} of {len(kept)} messages on '{topic}', of other frames")
     return [m for m, pair in zip(kept, frames) if pair == most]
 
 
@@ -238,9 +238,9 @@ def _in_time(t_ns: Stamps, poses: Array, topic: str, path: Path, remark: Callabl
         cure = "header.stamp must be the time of each measurement; after the clock restarts, use a new bag"
         raise SourceError(text, where=path, cure=cure)
     if repeated:
-        remark(f"{repeated} of {len(t_ns)} messages {where} repeat a stamp and were left out")
+        remark(f"left out: {repeated} of {len(t_ns)} messages {where}, with a repeated stamp")
     if late:
-        remark(f"{late} of {len(t_ns)} messages {where} came out of order and were sorted by their stamps")
+        remark(f"sorted by stamp: {late} of {len(t_ns)} messages {where}, which came out of order")
     return order
 
 

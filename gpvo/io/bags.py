@@ -163,7 +163,8 @@ def _choose_topics(
     if left is None or right is None:
         pair = _guess_pair(images, chain)
         if pair is None:
-            cure = "name them with --left-topic and --right-topic" if images else "is this the bag with the images?"
+            cure = "poses alone are for 'gpvo import'" if poses else "is this the bag with the images?"
+            cure = "name them with --left-topic and --right-topic" if images else cure
             text = f"no stereo pair among its image topics ({', '.join(images) or 'none'})"
             raise SourceError(text, where=path, cure=cure)
         left, right = left or pair[0], right or pair[1]

@@ -12,7 +12,7 @@ import numpy as np
 from gpvo.cameras.kalibr import calibration_text, read_imu_noise, read_sensor_pair, read_yaml, sensor_pose
 from gpvo.cameras.readers import find_calibration, left_camera_offset, read_kitti_calib, read_stereo_yaml
 from gpvo.cameras.rig import StereoRig
-from gpvo.errors import CalibrationError, SourceError
+from gpvo.errors import CalibrationError, SourceError, counted
 from gpvo.geometry import se3
 from gpvo.io.images import IMAGE_SUFFIXES, FileSource, PairFiles, first_size
 from gpvo.io.source import SourceReport
@@ -222,7 +222,7 @@ class KittiSource(FileSource):
                 raise SourceError("holds no images", where=folder, cure="expected names like 000000.png")
         surplus = {i for found in names for i in found if i >= len(stamps)}
         if surplus:
-            known.count("missing", f"{len(surplus)} frames have no line in times.txt", len(surplus))
+            known.count("missing", f"{counted(len(surplus), 'frame')} without a line in times.txt", len(surplus))
         suffix = next(iter(names[0].values())).suffix
         return [
             PairFiles(int(t), *(found.get(i, folder / f"{i:06d}{suffix}") for found, folder in zip(names, folders)))
@@ -237,7 +237,7 @@ class KittiSource(FileSource):
             return None
         T_world_cam0 = read_kitti_poses(file)
         if len(T_world_cam0) != len(stamps):
-            text = f"holds {len(T_world_cam0)} poses for the {len(stamps)} lines of times.txt"
+            text = f"holds {counted(len(T_world_cam0), 'pose')} for the {len(stamps)} lines of times.txt"
             cure = "KITTI poses have no stamps: both files must have one line per frame"
             raise SourceError(text, where=file, cure=cure)
         grows = growing(stamps)

@@ -8,7 +8,7 @@ from typing import Any
 
 from gpvo.cameras.kalibr import read_imu_noise
 from gpvo.cameras.readers import find_calibration, read_stereo_yaml
-from gpvo.errors import CalibrationError, SourceError
+from gpvo.errors import CalibrationError, SourceError, counted
 from gpvo.io.images import IMAGE_SUFFIXES, FileSource, PairFiles, first_size
 from gpvo.io.source import SourceReport
 from gpvo.io.stamps import PAIR_TOLERANCE_S, integer_ns, match_nearest, seconds_text_to_ns, tolerance_ns
@@ -145,8 +145,8 @@ def _stamps_by_line(path: Path, keys: list[str], numbers: dict[str, str], known:
         inside = {k: i - first for k, i in index.items() if 0 <= i - first < len(lines)}
         if len(inside) < len(keys):
             absent = len(keys) - len(inside)
-            known.count("missing", f"{absent} images have no line in times.txt", absent)
+            known.count("missing", f"{counted(absent, 'image')} without a line in times.txt", absent)
         return {k: int(lines[i]) for k, i in inside.items()}
     if len(keys) != len(lines):
-        raise SourceError(f"holds {len(lines)} stamps for {len(keys)} images", where=path / "times.txt")
+        raise SourceError(f"holds {counted(len(lines), 'stamp')} for {len(keys)} images", where=path / "times.txt")
     return {k: int(t) for k, t in zip(keys, lines, strict=True)}

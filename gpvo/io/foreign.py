@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from gpvo.errors import SourceError
+from gpvo.errors import SourceError, counted
 from gpvo.geometry import covariance as transport
 from gpvo.geometry import se3
 from gpvo.geometry.covariance import variances
@@ -25,9 +25,21 @@ from gpvo.stats.consistency import SEEN, seen_axes
 from gpvo.types import COUNT_FIELDS, FLOAT_FIELDS, Array
 
 FORMATS = ("tum", "kitti", "csv", "bag")
+_READ_BY = {
+    "--map": ("csv",),
+    "--topic": ("bag",),
+    "--covariance-of motion": ("csv",),
+    "--covariance-axes": ("csv", "bag"),
+}
 COVARIANCE_AXES = ("auto", "world", "body", "mixed")
 # FLU body at the camera's own place, looking forward.
 T_FLU_OPTICAL: Array = se3.from_rt(R_FLU_OPTICAL, np.zeros(3))
+PLACES = {
+    "cam": np.eye(4),
+    "body": T_FLU_OPTICAL,
+    "frd": se3.from_rt(se3.R_FRD_FLU, np.zeros(3)) @ T_FLU_OPTICAL,
+}
+"""Where the camera sits on what poses may be of."""
 # What a step adds to a variance, beyond rounding: of the variance, and of the least that is seen.
 _GROWS, _GROWS_SEEN = 1e-6, 1e-3
 _NAMED = 12  # columns in a remark
@@ -159,6 +171,11 @@ def read_foreign(
         raise SourceError(f"covariances are of pose or motion, in axes {' or '.join(COVARIANCE_AXES)}", where=p)
     if not p.exists():
         raise SourceError("no such file", where=p)
+    asked = {"--map": mapping, "--topic": topic, "--covariance-of motion": covariance_of == "motion"}
+    asked |= {"--covariance-axes": covariance_axes != "auto"}
+    if idle := [option for option, value in asked.items() if value and name not in _READ_BY[option]]:
+        cure = "leave it out, or name the format with --format or --truth-format"
+        raise SourceError(f"{idle[0]} has no effect on this file ({name})", where=p, cure=cure)
     if name == "tum":
         return ForeignLog(p, read_tum(p))
     if name == "kitti":
@@ -188,7 +205,7 @@ def _from_table(path: Path, table: Table, covariance_of: str, axes: str, complet
     trajectory = Trajectory(t, se3.from_quaternion(pose[:, :3], pose[:, 3:]))
     cov = _table_covariance(c, known)
     if cov is not None:
-        cov = _into_body(trajectory, cov, axes)
+        cov = into_body(trajectory.T_world_body, cov, axes)
         still = still_axes(trajectory.T_world_body)
         stated = np.array([f"cov_{i}{i}" in c for i in range(6)])
         planar = (stated | still).all() and stated[3:].any()  # of the position alone, it says nothing of the motion
@@ -200,7 +217,7 @@ def _from_table(path: Path, table: Table, covariance_of: str, axes: str, complet
         cov,
         covariance_of,
         {n: c[n][known] for n in (*COUNT_FIELDS, *FLOAT_FIELDS) if n in c},
-        (*notes, *((f"{lost} rows without a pose were left out",) if lost else ()), *_unused(table, cov)),
+        (*notes, *((f"left out: {counted(lost, 'row')} without a pose",) if lost else ()), *_unused(table, cov)),
     )
 
 
@@ -229,12 +246,13 @@ def _table_covariance(columns: Mapping[str, Array], known: NDArray[np.bool_]) ->
     return np.where(np.isfinite(C), C, np.nan)
 
 
-def _into_body(trajectory: Trajectory, covariance: Array, axes: str) -> Array:
-    """Covariances of fixed axes, unless ``axes`` says otherwise, turned into those of the moving frame."""
+def into_body(T_world_body: Array, covariance: Array, axes: str) -> Array:
+    """Covariances (..., 6, 6) of poses (..., 4, 4) in ``axes``, of :data:`COVARIANCE_AXES`, turned into those of the
+    moving frame; ``auto``: from the world's."""
     if axes == "body":
         return covariance
     of_rotation = np.eye(3) if axes == "mixed" else None
-    return se3.rotate_covariance(np.swapaxes(trajectory.T_world_body[:, :3, :3], -1, -2), covariance, of_rotation)
+    return se3.rotate_covariance(np.swapaxes(T_world_body[..., :3, :3], -1, -2), covariance, of_rotation)
 
 
 def still_axes(T_world_body: Array) -> NDArray[np.bool_]:
@@ -266,7 +284,7 @@ def check_same_rows(truth: ForeignLog, log: ForeignLog) -> None:
     Raises SourceError, naming both counts.
     """
     if truth.is_counted and log.is_counted and len(truth.t_ns) != len(log.t_ns):
-        text = f"holds {len(truth.t_ns)} poses for the {len(log.t_ns)} of {log.path.name}"
+        text = f"holds {counted(len(truth.t_ns), 'pose')} for the {len(log.t_ns)} of {log.path.name}"
         cure = "with --rate-hz both must have a line per frame; else give --times, or TUM files with stamps"
         raise SourceError(text, where=truth.path, cure=cure)
 
@@ -279,7 +297,7 @@ def _read_kitti(path: Path, times: str | Path | None, rate_hz: float | None) -> 
     if times is not None:
         t = read_times(times)
         if len(t) != len(T):
-            raise SourceError(f"holds {len(t)} stamps for the {len(T)} poses of {path.name}", where=times)
+            raise SourceError(f"holds {counted(len(t), 'stamp')} for the {len(T)} poses of {path.name}", where=times)
         check_growing(Path(times), t, list(range(1, len(t) + 1)))
         check_interval(t, times, lambda _: "the file of --times holds seconds", is_stated=True)
     elif rate_hz is not None:
@@ -311,7 +329,7 @@ def _read_bag_topic(path: Path, topic: str, axes: str, complete: bool) -> Foreig
     stated = (covariances_of(read, name) for name in ("twist", "pose"))
     twist, pose = (None if C is None else np.where(np.isfinite(C), C, np.nan) for C in stated)
     still = still_axes(T)
-    pose = None if pose is None else definite_in_plane(_into_body(log.trajectory, pose, axes), still)
+    pose = None if pose is None else definite_in_plane(into_body(T, pose, axes), still)
     twist = None if twist is None else definite_in_plane(twist, still)
     if twist is not None and _looks_stated(twist):
         # Of the velocity in the child frame over the step that ends at the stamp.

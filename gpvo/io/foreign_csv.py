@@ -11,10 +11,11 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from gpvo.errors import SourceError
+from gpvo.errors import SourceError, counted
 from gpvo.io.stamps import (
     UNITS_NS,
     check_interval,
+    cure_of_end,
     cure_of_number,
     integer_ns,
     is_number,
@@ -61,8 +62,15 @@ _AXES = {f"{of}{axis}": i + 3 * (of == "r") for of in ("", "p", "t", "r") for i,
 _AXES |= {"roll": 3, "pitch": 4, "yaw": 5, "r": 3, "p": 4}
 _AXIS = "roll|pitch|yaw|[prt]?[xyz]|r|p"
 _COVARIANCE = re.compile(rf"(?:pose_|position_)?(?:cov|covariance)_({_AXIS})_?({_AXIS})")
-_POSED = re.compile(r"(?:.*_)?(p|t|pos|position|translation|q|quat|ori|orientation|rotation)(?:_rs_r|_rs)?_?([xyzw])")
+_POSED = re.compile(
+    r"(?:.*_)?(p|t|pos|position|translation|q|quat|quaternion|ori|orientation|rot|rotation)(?:_rs_r|_rs)?_?([xyzw])"
+)
+_NUMBERED = re.compile(r"(?:.*[_.])?q(?:uat|uaternion)?_?\[?[0-3]\]?", re.IGNORECASE)
 _VARIANCE = re.compile(rf"(?:pose_|position_)?(?:var|variance)_({_AXIS})")
+_LENGTHS_M = {"m": 1.0, "mm": 1e-3, "cm": 1e-2, "km": 1e3, "ft": 0.3048}
+_ANGLES_RAD = {"rad": 1.0, "mrad": 1e-3, "deg": np.pi / 180}
+# In brackets, or behind an underscore; of a variance, squared or not.
+_UNIT = re.compile(rf"(?:[\[(] *|_)({'|'.join((*_LENGTHS_M, *_ANGLES_RAD))})(?:\^?2|²)?(?: *[\])])?$")
 _UNCERTAIN = re.compile(r"cov|var|sigma|std|^p_?\d\d$", re.IGNORECASE)
 
 
@@ -84,8 +92,9 @@ def read_table(path: Path, mapping: Mapping[str, str]) -> Table:
 
     ``mapping`` gives column name -> target (one of :data:`TARGETS`) and goes before what the names suggest. A stamp is
     in the unit of its target or name; where only a guess says seconds, 16 digits and more are nanoseconds. ROS's
-    nanoseconds beyond whole seconds are added where their column stands beside. Raises
-    SourceError, naming file and line, or the column that is wanted.
+    nanoseconds beyond whole seconds are added where their column stands beside. Positions and covariances are in the
+    unit of their column's name, else in m and rad. Raises SourceError, naming file and line, or the column that is
+    wanted.
     """
     lines = _lines(path)
     first = next(lines, None)
@@ -105,8 +114,9 @@ def read_table(path: Path, mapping: Mapping[str, str]) -> Table:
         if len(rows) >= _MAX_ROWS:
             raise SourceError(f"has more than {_MAX_ROWS} rows", where=path)
         if len(fields) < len(header) or any(fields[len(header) :]):  # empty: VINS ends its lines with a comma
-            cure = None if len(fields) < len(header) else "name every column, and write numbers with a decimal point"
-            what = f"line {number} holds {len(fields)} fields, the header {len(header)}"
+            too_long = "name every column, and write numbers with a decimal point"
+            cure = too_long if len(fields) >= len(header) else cure_of_end(path, number) if rows else None
+            what = f"line {number} holds {counted(len(fields), 'field')}, the header {len(header)}"
             raise SourceError(what, where=path, cure=cure)
         text = fields[targets[stamp]]
         try:
@@ -128,9 +138,10 @@ def read_table(path: Path, mapping: Mapping[str, str]) -> Table:
     check_interval(stamps, path, lambda unit: _unit_cure(column, unit), is_stated=is_stated)
     data = np.array(rows, dtype=np.float64)
     unused = tuple(c for k, c in enumerate(header) if k not in targets.values() and _UNCERTAIN.search(c))
-    columns = {n: data[:, i] for i, n in enumerate(order)}
+    columns = {n: data[:, i] * _to_si(header[targets[n]], n) for i, n in enumerate(order)}
     axes = "mixed" if "cov_33" in targets and _plain(header[targets["cov_33"]]) in _OPENVINS else "world"
-    return Table(np.array(stamps, dtype=np.int64), columns, numbers, unused, () if top else (NO_HEADER,), axes)
+    notes = (*(() if top else (NO_HEADER,)), *_units_apart({n: header[targets[n]] for n in order}))
+    return Table(np.array(stamps, dtype=np.int64), columns, numbers, unused, notes, axes)
 
 
 def _lines(path: Path) -> Iterator[tuple[int, list[str]]]:
@@ -216,6 +227,9 @@ def _targets(path: Path, header: list[str], mapping: Mapping[str, str]) -> dict[
         cure = f"name it with --map COLUMN={absent[0]}, for ground truth with --truth-map"
         if {"roll", "pitch", "yaw"} <= {_plain(c).removesuffix("_deg").removesuffix("_rad") for c in header}:
             cure = _ANGLES
+        elif len(q := [c for c in header if _NUMBERED.fullmatch(c)]) == 4:
+            named = " ".join(f"--map '{c}={name}'" for c, name in zip(q, ("q_w", "q_x", "q_y", "q_z")))
+            cure = f"numbers do not tell which is w: if the first, as in PX4's logs, give {named}"
         elif absent == list(_POSE[3:]):
             cure += f"; {POSITIONS_ALONE}"
         raise SourceError(text, where=path, cure=cure)
@@ -228,8 +242,27 @@ def _is_plain(column: str) -> bool:
 
 
 def _plain(column: str) -> str:
-    """The name of a column in small letters with underscores, without a unit in brackets."""
+    """The name of a column in small letters with underscores, without its unit in brackets."""
     return re.sub(r"[./ ]+", "_", re.sub(r"[\[(].*?[\])]", "", column).strip().lower()).lstrip("#%").strip("_")
+
+
+def _to_si(column: str, target: str) -> float:
+    """What the numbers of a column are multiplied by to be metres or radians, of a covariance their squares or
+    products, by the unit in its name; 1 where that states none."""
+    unit = _UNIT.search(column.strip().lower())
+    if unit is None or target[:2] not in ("p_", "co"):
+        return 1.0
+    units = [_ANGLES_RAD if axis in "345" else _LENGTHS_M for axis in target[4:]] or [_LENGTHS_M]
+    if not all(unit[1] in known for known in units):
+        return 1.0
+    return float(np.prod([known[unit[1]] for known in units]))
+
+
+def _units_apart(named: Mapping[str, str]) -> Iterator[str]:
+    """A remark where positions state a unit that is converted, and covariances none; ``named``: columns by target."""
+    odd = [column for target, column in named.items() if target[:2] == "p_" and _to_si(column, target) != 1.0]
+    if odd and any(target[:4] == "cov_" and not _UNIT.search(column) for target, column in named.items()):
+        yield f"{odd[0]} is converted to metres, the covariances, which name no unit, are not"
 
 
 def _rest_of_seconds(header: list[str], column: str) -> int | None:
@@ -244,6 +277,7 @@ def _suggest(column: str) -> str | None:
     unit, name = re.search(r"[\[(](.*?)[\])]", column), re.sub(r"^.*header_(?=stamp)", "", _plain(column))
     if name in TARGETS:
         return name
+    name = _UNIT.sub("", name)
     if name in _STAMP_NAMES:
         said = unit[1].strip() if unit else name.rpartition("_")[2]
         return f"t_{said}" if said in UNITS_NS else "t_s"

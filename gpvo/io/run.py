@@ -196,7 +196,7 @@ class RunWriter:
     def _release(self) -> None:
         if self.path != self._target and not (self._chunks / run_folder.STATE).is_file():
             # Where the new run is not whole, the finished one that it was to replace is worth more.
-            shutil.rmtree(self.path, ignore_errors=True)
+            run_folder.discard(self.path)
         self._lock.release()
 
     def _write_meta(self, *, complete: bool) -> None:
@@ -280,7 +280,7 @@ def copy_run(
         write_json(new / "run.json", {**run.meta, "name": target.name, **(meta or {}), "digests": digests})
         run_folder.put_in_place(new, target)
     finally:
-        shutil.rmtree(new, ignore_errors=True)
+        run_folder.discard(new)
         lock.release()
 
 

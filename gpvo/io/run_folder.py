@@ -7,6 +7,7 @@ import json
 import os
 import shutil
 import sys
+from contextlib import suppress
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
@@ -86,18 +87,34 @@ def claim(path: Path) -> FolderLock:
 
 
 def put_in_place(new: Path, target: Path) -> None:
-    """Exchange a folder for a newer one, in one step where the system can: else ``target`` is missing for a moment."""
-    if _exchanged(new, target):
-        shutil.rmtree(new, ignore_errors=True)
-        return
-    old = target.with_name(f".{target.name}.old")
+    """Exchange a folder for a newer one, in one step where the system can: else ``target`` is missing for a moment.
+    What else lay in it than a run stays."""
+    old = new if _exchanged(new, target) else target.with_name(f".{target.name}.old")
     try:
-        shutil.rmtree(old, ignore_errors=True)
-        os.replace(target, old)
-        os.replace(new, target)
+        if old is not new:
+            os.replace(target, old)
+            os.replace(new, target)
+        clear(old)
+        for other in old.iterdir():
+            os.replace(other, target / other.name)
     except OSError as error:
         raise OutputError(f"cannot be replaced: {error.strerror}; run the command again", where=target) from None
-    shutil.rmtree(old, ignore_errors=True)
+    discard(old)
+
+
+def clear(path: Path, *, keep_chunks: bool = False) -> None:
+    """Remove a run, whole or not, and no other file. Raises OSError where that is not possible."""
+    if not keep_chunks:
+        shutil.rmtree(path / "chunks", ignore_errors=True)
+    for file in (*path.glob(".*.part"), *(path / name for name in OWN)):
+        file.unlink(missing_ok=True)
+
+
+def discard(path: Path) -> None:
+    """The same, with its folder if that holds no more, as far as possible."""
+    with suppress(OSError):
+        clear(path)
+        path.rmdir()
 
 
 def _exchanged(one: Path, other: Path) -> bool:
@@ -111,14 +128,10 @@ def prepare(path: Path, *, keep_chunks: bool) -> None:
     """Make the folder; clear an older run of exactly the files that a run has."""
     try:
         make_folder(path)
-        unfinished = [p for p in path.iterdir() if p.name.startswith(".") and p.name.endswith(".part")]
-        present = {p.name for p in path.iterdir()} - {p.name for p in unfinished}
+        present = {p.name for p in path.iterdir()} - {p.name for p in path.glob(".*.part")}
         if present and "run.json" not in present:
             raise SourceError("holds something that is not a run", where=path, cure="choose an empty folder with -o")
-        if not keep_chunks:
-            shutil.rmtree(path / "chunks", ignore_errors=True)
-        for file in (*unfinished, *(path / name for name in OWN)):
-            file.unlink(missing_ok=True)
+        clear(path, keep_chunks=keep_chunks)
     except OSError as error:
         raise OutputError(f"cannot be written: {error.strerror}", where=path) from None
 

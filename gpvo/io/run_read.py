@@ -13,7 +13,7 @@ from typing import Any, TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
-from gpvo.errors import CalibrationError, SourceError, printable
+from gpvo.errors import CalibrationError, SourceError, counted, printable
 from gpvo.files import read_json, read_toml
 from gpvo.geometry.covariance import LARGEST, are_semidefinite, variances
 from gpvo.io import run_table
@@ -38,6 +38,7 @@ from gpvo.types import (
 T = TypeVar("T")
 
 _MAX_SCHEMA = 1
+_MAKE = "make one with 'gpvo run' of images, or 'gpvo import' of poses"
 _LARGEST = 1e12  # No mean or variance that a model states is larger [m, rad, m^2, rad^2].
 
 
@@ -65,9 +66,9 @@ class Run:
         return stored.only(self.log.t_ns[stored.rows_of(self.log) >= 0].tolist())
 
     def __str__(self) -> str:
-        parts = [f"{len(self.log)} records"]
+        parts = [counted(len(self.log), "record")]
         parts += [word for word, has in (("truth", self.truth), ("imu", self.imu)) if has is not None]
-        parts += [f"{len(self.predictions)} predictions"] if self.predictions else []
+        parts += [counted(len(self.predictions), "prediction")] if self.predictions else []
         return f"{self.name}: {', '.join(parts)}"
 
 
@@ -87,10 +88,10 @@ def read_run(path: str | Path | Run) -> Run:
     p = Path(path)
     if not p.is_dir():
         what = "is a file, not a run folder" if p.exists() else "no such run folder"
-        cure = f"give its folder, {p.parent}" if is_run(p.parent) else "make one with 'gpvo run SOURCE -o RUN'"
+        cure = f"give its folder, {p.parent}" if is_run(p.parent) else _MAKE
         raise SourceError(what, where=p, cure=cure)
     if not (p / "run.json").is_file():
-        raise SourceError("is not a run folder: it lacks run.json", where=p, cure="make one with 'gpvo run'")
+        raise SourceError("is not a run folder: it lacks run.json", where=p, cure=_MAKE)
     meta = read_meta(p)
     camera, mounting = _read_rig(p / "rig.json")
     log = _read_log(p, camera, _vehicle_of(meta, p / "run.json"))

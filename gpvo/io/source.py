@@ -16,7 +16,7 @@ from typing import Any, Literal, Protocol, runtime_checkable
 import numpy as np
 from numpy.typing import NDArray
 
-from gpvo.errors import SourceError, plugins, printable
+from gpvo.errors import SourceError, counted, plugins, printable
 from gpvo.types import ImuLog, Mounting, StereoCamera, StereoFrame, TrackFrame, TruthLog
 
 
@@ -51,7 +51,7 @@ class SourceReport:
     def __str__(self) -> str:
         names = ("missing", "unreadable", "duplicate", "out_of_order", "gaps")
         bad = [f"{getattr(self, n)} {n.replace('_', '-')}" for n in names if getattr(self, n)]
-        return f"{self.frames} frames" + (f" ({', '.join(bad)})" if bad else "")
+        return counted(self.frames, "frame") + (f" ({', '.join(bad)})" if bad else "")
 
 
 class Depth:
@@ -159,7 +159,7 @@ def guess(path: str | Path) -> str:
         where=p,
         cure="known are EuRoC/ASL (mav0/), KITTI odometry (calib.txt, image_0/), ROS bags (.bag, .db3, .mcap, or a"
         " folder of those of one recording), image pairs with a camchain.yaml, and tracks (.npz); name one with"
-        " --source",
+        " --source; poses alone are for 'gpvo import'",
     )
 
 

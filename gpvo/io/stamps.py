@@ -60,6 +60,12 @@ def text_lines(path: Path) -> Iterator[tuple[int, str]]:
         raise SourceError(f"cannot be read: {error.strerror}", where=path) from None
 
 
+def cure_of_end(path: Path, number: int) -> str | None:
+    """What to do about a line that is too short, if it is the file's last; None for any other."""
+    is_last = all(n <= number for n, _ in text_lines(path))
+    return "the file breaks off in this line: remove it" if is_last else None
+
+
 def _not_text(number: int, path: Path) -> SourceError:
     """What to raise where a line holds NUL. Of text in UTF-16 the first line does; file systems fill up with NUL what
     was not on the disk yet when power was lost."""

@@ -130,7 +130,7 @@ def to_records(log: ForeignLog) -> tuple[list[VoRecord], list[str]]:
     if unknown:
         notes.append(f"motions that count as lost, as their covariance says that they are unknown: {len(unknown)}")
     if cov is not None and (bad := int((np.isfinite(cov).all(axis=(1, 2)) & ~are_covariances(cov))[1:].sum())):
-        notes.append(f"{bad} of {len(motions)} covariances are not positive definite and were left out")
+        notes.append(f"left out: {bad} of {len(motions)} covariances, not positive definite")
     if len(steps) and not log.is_counted and (usual_s := float(np.median(steps)) * 1e-9) > _UNUSUAL_S:
         notes.append(
             f"its frames are {usual_s:.3g} s apart as read: are the stamps milliseconds, or numbers of frames?"

@@ -10,13 +10,14 @@ from pathlib import Path
 
 import numpy as np
 
-from gpvo.errors import SourceError
+from gpvo.errors import SourceError, counted
 from gpvo.files import replacing
 from gpvo.geometry import se3
 from gpvo.io.stamps import (
     Stamps,
     astray,
     check_interval,
+    cure_of_end,
     cure_of_number,
     cure_of_seconds,
     cure_of_unit,
@@ -86,7 +87,8 @@ def read_kitti_poses(path: str | Path) -> Array:
     for number, fields in _fields(p, None):
         values = _floats(p, number, fields, _REMOVE_OF_KITTI)
         if len(values) != 12:
-            raise SourceError(f"line {number} holds {len(values)} numbers, expected 12 (a 3x4 matrix)", where=p)
+            what = f"line {number} holds {counted(len(values), 'number')}, expected 12 (a 3x4 matrix)"
+            raise SourceError(what, where=p)
         out.append(values)
     if not out:
         raise SourceError("holds no poses", where=p)
@@ -109,7 +111,7 @@ def read_times(path: str | Path) -> Stamps:
     for number, fields in _fields(p, None):
         try:
             if len(fields) != 1:
-                raise ValueError(f"{len(fields)} fields, expected 1")
+                raise ValueError(f"{counted(len(fields), 'field')}, expected 1")
             stamps.append(seconds_text_to_ns(fields[0]))
         except ValueError as error:
             raise SourceError(f"line {number}: {error}", where=p) from None
@@ -161,11 +163,15 @@ def _read_poses(
 ) -> tuple[Trajectory, list[list[str]]]:
     """Lines of a stamp and the seven numbers of a pose, where ``q_xyzw`` of these are the quaternion; and what follows
     them in each line, up to the least of the ``counts`` of fields that are allowed, ``what`` in words."""
-    numbers, stamps, poses, behind = [], [], [], []
+    numbers: list[int] = []
+    stamps, poses, behind = [], [], []
     for number, fields in _fields(path, separator):
         if len(fields) not in counts:
-            cure = None if separator else "'gpvo import', of a log or as --truth of a run, takes CSV, KITTI and bags"
-            raise SourceError(f"line {number} holds {len(fields)} fields, expected {what}", where=path, cure=cure)
+            cure = cure_of_end(path, number) if numbers and len(fields) < counts.start else None
+            others = "'gpvo import', of a log or as --truth of a run, takes CSV, KITTI and bags"
+            cure = cure or (None if separator else others)
+            held = counted(len(fields), "field")
+            raise SourceError(f"line {number} holds {held}, expected {what}", where=path, cure=cure)
         try:
             stamps.append(stamp(fields[0]))
         except ValueError as error:

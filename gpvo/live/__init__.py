@@ -46,6 +46,9 @@ class LiveSettings:
     odometry_type: Annotated[str, "Type of that topic: odometry, pose (PoseWithCovarianceStamped) or pose_stamped."] = (
         "odometry"
     )
+    covariance_axes: Annotated[
+        str, "Axes of the covariances of its poses: world (auto), body, or mixed, as of OpenVINS; see gpvo import."
+    ] = "auto"
     truth: Annotated[str | None, "Topic of delayed ground truth (mocap, tags); the covariance adapts to it."] = None
     truth_type: Annotated[str, "Type of that topic: pose, odometry or pose_stamped."] = "pose"
     replay: Annotated[Path | None, "Replay a bag instead of listening to a transport."] = None

@@ -18,7 +18,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from gpvo.errors import GpvoError, SourceError
+from gpvo.errors import GpvoError, SourceError, counted
 from gpvo.geometry import se3
 from gpvo.geometry.covariance import are_covariances, variances
 from gpvo.io.bag_reader import POSE_TYPES, is_bag, messages, open_bag, topics_of
@@ -171,7 +171,7 @@ def _jumps(steps: Array, dt: Array) -> Iterator[Finding]:
     jumps = speed > max(20 * float(np.median(speed)), 20.0)
     if jumps.any():
         size = float(np.linalg.norm(steps[jumps][:, :3], axis=1).max())
-        what = f"{int(jumps.sum())} jumps of the pose, up to {size:.2g} m"
+        what = f"{counted(int(jumps.sum()), 'jump')} of the pose, up to {size:.2g} m"
         text = "odometry must be continuous (REP 105): a differential pose fuses the jump as speed"
         yield Finding("pose-jump", what, text)
 

@@ -192,15 +192,16 @@ def _source_stage(settings: LiveSettings) -> PoseStage | StereoStage:
         path = settings.calibration
         is_kitti = path is not None and path.suffix.lower() == ".txt"  # which does not state the size of the images
         rig = path if path is None or is_kitti else read_stereo_yaml(path)
+        _refuse_idle(settings, ("covariance_axes",), "images state no covariance")
         return StereoStage(*settings.stereo, settings.imu, rig, settings.vo)
     if settings.vo not in (None, StereoSettings()):
         raise GpvoError("the odometry was given settings, but no images to run on", cure="add --stereo LEFT RIGHT")
     _refuse_idle(settings, ("imu", "calibration"), "add --stereo LEFT RIGHT")
     if settings.odometry is not None:
-        return PoseStage(settings.odometry)
+        return PoseStage(settings.odometry, covariance_axes=settings.covariance_axes)
     if settings.replay is None:
         raise GpvoError("no input was given", cure="give --stereo LEFT RIGHT or --odometry TOPIC")
-    return PoseStage(odometry_topic(settings.replay))
+    return PoseStage(odometry_topic(settings.replay), covariance_axes=settings.covariance_axes)
 
 
 def topics_in(stage: Stage, settings: LiveSettings) -> dict[str, str]:

@@ -22,10 +22,9 @@ from gpvo.geometry.covariance import (
     is_symmetric,
     symmetrise,
 )
-from gpvo.geometry.se3 import rotate_covariance
 from gpvo.io.bag_messages import pose_of
 from gpvo.io.bag_reader import stamp_ns
-from gpvo.io.foreign import T_FLU_OPTICAL, definite_in_plane, is_optical, moving_frame
+from gpvo.io.foreign import T_FLU_OPTICAL, definite_in_plane, into_body, is_optical, moving_frame
 from gpvo.io.stated import is_turn_unknown
 from gpvo.io.trajectory import FARTHEST_M
 from gpvo.live.intake import CONFIRM, Arrival, Sequence, StampWatch
@@ -98,15 +97,15 @@ class PoseStage:
     The same rules as in :mod:`gpvo.io.foreign`, message by message: the covariance of a motion is that of the twist
     where it is positive definite, else the growth of the pose's; of a robot in a plane, on the axes along which it has
     moved. ``T_body_cam``: where the camera sits on the body that the poses describe; by default as the messages name
-    their frame, optical or not.
+    their frame, optical or not. ``covariance_axes``: of the poses' covariances, as ``read_foreign`` has them.
     """
 
     method = IMPORTED
     camera: StereoCamera | None = None
     odometry: Mapping[str, Any] = MappingProxyType({})
 
-    def __init__(self, topic: str, T_body_cam: Array | None = None) -> None:
-        self.topic, self._is_fixed = topic, T_body_cam is not None
+    def __init__(self, topic: str, T_body_cam: Array | None = None, covariance_axes: str = "auto") -> None:
+        self.topic, self._is_fixed, self._axes = topic, T_body_cam is not None, covariance_axes
         self.counts: Counter[str] = Counter()
         self._place(T_FLU_OPTICAL if T_body_cam is None else T_body_cam)
         self.reset()
@@ -169,7 +168,7 @@ class PoseStage:
     def _record(self, t_ns: int, T_parent_cam: Array, message: Any, seen: Sequence) -> VoRecord:
         before, pose = self._last, stated_covariance(getattr(message, "pose", None))
         if pose is not None:  # in the body's axes
-            pose = rotate_covariance((T_parent_cam @ self._T_cam_body)[:3, :3].T, pose)
+            pose = into_body(T_parent_cam @ self._T_cam_body, pose, self._axes)
         self._last = (t_ns, T_parent_cam, pose)
         if before is None:
             return VoRecord(t_ns, t_ns, Status.START, np.eye(4))

@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from gpvo.errors import GpvoError, printable
+from gpvo.errors import GpvoError, counted, printable
 from gpvo.geometry import se3
 from gpvo.geometry.covariance import LARGEST
 from gpvo.io.bag_messages import covariances_of, pose_of
@@ -59,7 +59,8 @@ class Stated:
         """From messages of a bag ``where``, in the order of their arrival. GpvoError where there are fewer than ten."""
         kept = list(messages)
         if len(kept) < ENOUGH:
-            raise GpvoError(f"{len(kept)} messages are too few to judge", where=where, cure=f"record at least {ENOUGH}")
+            what = f"{counted(len(kept), 'message')}: too few to judge"
+            raise GpvoError(what, where=where, cure=f"record at least {ENOUGH}")
         rows = np.array([pose_of(m) for m in kept])
         norm = np.linalg.norm(rows[:, 3:], axis=1)
         near = np.abs(rows[:, :3]).max(axis=1) < FARTHEST_M  # false for NaN

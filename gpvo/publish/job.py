@@ -12,7 +12,7 @@ import numpy as np
 
 from gpvo.dataset.build import predictions_of
 from gpvo.dataset.check import warn_of_misfits
-from gpvo.errors import GpvoError
+from gpvo.errors import GpvoError, counted
 from gpvo.files import refuse_foreign, write_text
 from gpvo.io.run import Run, read_run
 from gpvo.io.stamps import END_OF_ROS_NS
@@ -47,8 +47,8 @@ class Published:
         return {"schema": 1, **told, "checks": [v.document() for v in self.verdicts]}
 
     def __str__(self) -> str:
-        written = f"{self.out}: {self.messages} messages" if self.out else f"{self.run}: nothing written"
-        head = f"{written}, covariance from {self.source}, {self.lost} lost frames"
+        written = f"{self.out}: {counted(self.messages, 'message')}" if self.out else f"{self.run}: nothing written"
+        head = f"{written}, covariance from {self.source}, {counted(self.lost, 'lost frame')}"
         if self.outside:
             head += f", {self.outside} far outside the model's domain (MAVLink quality -1: ArduPilot refuses them)"
         return "\n".join([head, *(f"{self.consumer} {v}" for v in self.verdicts)])
@@ -134,10 +134,6 @@ def _check_stamps(run: Run, odometry: Sequence[Odometry], settings: PublishSetti
         raise GpvoError(f"has stamps {when}", where=run.path, cure="subtract an offset from the stamps of its source")
 
 
-def _kind(settings: PublishSettings, out: Path) -> str:
-    return "mcap" if settings.to == "mcap" else "ros1" if out.suffix.lower() == ".bag" else "sqlite3"
-
-
 def _parameters(bag: Path) -> Path:
     return bag.with_name(f"{bag.stem}_robot_localization.yaml")
 
@@ -148,7 +144,7 @@ def _refuse_other(settings: PublishSettings) -> None:
     if settings.to == "mavlink":
         refuse_foreign(settings.out, *mavlink.TLOG)
     else:
-        ros.refuse_other(settings.out, settings.topic, _kind(settings, settings.out))
+        ros.refuse_other(settings.out, settings.topic, ros.kind_of(settings.out, settings.to))
         refuse_foreign(_parameters(settings.out), *_PARAMETERS)
 
 
@@ -162,7 +158,7 @@ def _write(run: Run, odometry: Sequence[Odometry], settings: PublishSettings) ->
         return str(out), mavlink.write_tlog(out, odometry, system=settings.system)
     if all(o.twist_body is None for o in odometry):
         raise GpvoError("no frame has a motion: nothing to put into a bag", where=run.path)
-    kind = _kind(settings, out)
+    kind = ros.kind_of(out, settings.to)
     count = ros.write_bag(out, odometry, settings.topic, kind)
     rate_hz = 1.0 / float(np.median(np.diff([o.t_ns for o in odometry])) * 1e-9)
     text = ros.robot_localization_yaml(settings.topic, rate_hz=max(30.0, rate_hz), ros1=kind == "ros1")

@@ -92,17 +92,18 @@ def write_bag(
     ``seq``: of the first message, in ROS 1. Raises GpvoError where something else lies there, or nothing can be
     written.
     """
-    kind = kind or _kind(path)
+    kind = kind or kind_of(path)
     return _write(path, _serialised(odometry, kind, seq), topic, kind)
 
 
 def join_bags(path: Path, parts: Iterable[Path], topic: str = TOPIC) -> int:
     """The same of the messages of other bags that :func:`write_bag` wrote, of the kind that the suffix says."""
-    return _write(path, _raw(parts), topic, _kind(path))
+    return _write(path, _raw(parts), topic, kind_of(path))
 
 
-def _kind(path: Path) -> str:
-    return {".bag": "ros1", ".mcap": "mcap"}.get(path.suffix.lower(), "sqlite3")
+def kind_of(path: Path, to: str | None = None) -> str:
+    """``ros1``, ``mcap`` or ``sqlite3``, as the suffix says, or where it says nothing, what is asked for."""
+    return {".bag": "ros1", ".mcap": "mcap"}.get(path.suffix.lower(), "mcap" if to == "mcap" else "sqlite3")
 
 
 def refuse_other(path: Path, topic: str, kind: str) -> None:

@@ -16,6 +16,7 @@ import pytest
 import typer.main
 from gpvo.cli import app
 from gpvo.cli.common import with_common_options
+from gpvo.errors import counted
 from gpvo.io.run import write_run
 from synthetic_runs import make_run
 from typer.testing import CliRunner
@@ -181,6 +182,19 @@ def test_a_narrow_terminal_breaks_no_number_and_a_closed_one_no_command():
     assert (done.returncode, done.stderr) == (0, "")
 
 
+def test_a_name_that_the_terminal_cannot_show_stops_no_command(tmp_path: Path):
+    """As in a locale of ASCII, or in a pipe on Windows: it ended in a traceback, with the work done."""
+    run = shutil.copytree(UNSEEN, tmp_path / "Flüge 飛行")
+    env = {**os.environ, "PYTHONIOENCODING": "ascii"}
+    words = [sys.executable, "-m", "gpvo", "info", str(run)]
+    done = subprocess.run(words, capture_output=True, text=True, timeout=120, env=env)
+    assert (done.returncode, done.stderr) == (0, "")
+    assert "Fl\\xfcge \\u98db\\u884c" in done.stdout
+    env = {**os.environ, "PYTHONUTF8": "0", "LC_ALL": "C"}
+    done = subprocess.run(words, capture_output=True, text=True, timeout=120, env=env)
+    assert done.returncode == 0 or "(set PYTHONUTF8=1, or rename the file)" in done.stderr
+
+
 def test_tables_fit_80_columns():
     done = gpvo("evaluate", UNSEEN, "--model", MODEL, "--truth-sigma", "0.01")
     rows = [
@@ -267,3 +281,38 @@ def test_a_long_log_is_not_worked_on_in_silence(tmp_path: Path, bar: str, words:
     os.close(reader)
     assert process.returncode == 0, shown
     assert f"{bar} ".encode() in shown
+
+
+@pytest.mark.parametrize(
+    ("slow", "words"),
+    [
+        ("gpvo.learning.store", ["train", "a", "-o", "m.gpvo"]),
+        ("gpvo.twin.replicate", ["evaluate", "a", "--twins"]),
+        ("gpvo.twin.replicate", ["twin", "a", "-o", "twins"]),
+        ("gpvo.evaluation.fusion", ["fuse", "a", "--twins"]),
+    ],
+)
+def test_a_terminal_shows_something_before_what_takes_seconds_to_load(slow: str, words: list[str]):
+    script = f"""
+import io, os, sys
+from gpvo.cli import app, output
+from rich.console import Console
+shown = io.StringIO()
+output._terminal = lambda: Console(file=shown, force_terminal=True)
+class Watching:
+    def find_spec(self, name, *_):
+        if name == {slow!r}:
+            print(bool(shown.getvalue()), file=sys.__stdout__, flush=True)
+            os._exit(0)
+sys.meta_path.insert(0, Watching())
+app({words!r})
+"""
+    done = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True, timeout=120)
+    assert done.stdout == "True\n", done.stderr
+
+
+def test_one_of_anything_is_not_a_plural(tmp_path: Path):
+    assert [counted(n, "window") for n in (0, 1, 2)] == ["0 windows", "1 window", "2 windows"]
+    (tmp_path / "log.tum").write_text("1.0 0 0 0 0 0 0 1\n")
+    done = gpvo("import", str(tmp_path / "log.tum"), "-o", str(tmp_path / "run"))
+    assert done.stdout == f"{tmp_path / 'run'}: 1 record, 0 with truth\n"

@@ -108,6 +108,24 @@ def test_a_file_holds_a_camera_and_nothing_is_said(tmp_path):
     )
 
 
+def test_a_log_of_px4_is_its_body_seen_from_below(tmp_path):
+    """NED world and FRD body, as a flight controller logs them, give the run that ENU and FLU give."""
+    stamps, world, body = np.array(seq.stamps(N)), se3.from_rt(se3.R_NED_ENU, [5, 6, 7]), np.eye(4)
+    body[:3, :3] = se3.R_FRD_FLU
+    write_tum(tmp_path / "flu.tum", stamps, BODY)
+    write_tum(tmp_path / "frd.tum", stamps, world @ BODY @ body)
+    runs = {}
+    for name, frame in (("flu", "body"), ("frd", "frd")):
+        log = tmp_path / f"{name}.tum"
+        _call("import", log, "--truth", log, "-o", tmp_path / name, "--frame", frame)
+        runs[name] = read_run(tmp_path / name)
+    for flu, frd in zip(runs["flu"].log, runs["frd"].log, strict=True):
+        np.testing.assert_allclose(frd.T_prev_cur, flu.T_prev_cur, atol=1e-7)
+    np.testing.assert_array_equal(runs["frd"].mounting.T_body_cam, T_FLU_OPTICAL)
+    truth = runs["frd"].truth.T_world_cam
+    np.testing.assert_allclose(se3.inverse(truth[:-1]) @ truth[1:], se3.inverse(CAMERA[:-1]) @ CAMERA[1:], atol=1e-7)
+
+
 def test_odometry_of_a_bag_is_published_as_it_came(tmp_path):
     """Ahead is ahead and left is left, from the messages of a robot to the messages of gpvo."""
     _call("import", _odometry(tmp_path / "a.bag", BODY, "base_link"), "-o", tmp_path / "run")

@@ -121,3 +121,36 @@ def test_a_current_folder_that_is_gone_is_named(
     code, said = main(capsys, monkeypatch, "import", made["plan"], "-o", "run")
     assert (code, said) == (2, ["gpvo: the current folder: No such file or directory"])
     assert main(capsys, monkeypatch, "import", made["plan"], "-o", tmp_path / "run") == (0, [])
+
+
+@pytest.mark.parametrize(
+    "words",
+    [
+        ["evaluate", "nowhere", "--tables"],
+        ["evaluate", "nowhere", "--plots"],
+        ["evaluate", "nowhere", "--stated"],
+        ["fuse", "nowhere", "--log"],
+        ["train", "nowhere", "nowhere-else", "-o", "{free}", "--statements"],
+        ["score", str(ROOT / "docs" / "scoreboard"), "-o"],
+    ],
+)
+def test_a_folder_that_cannot_be_written_is_refused_before_the_work(
+    capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch, tmp_path: Path, words: list[str]
+) -> None:
+    """Which may take minutes, and was lost: here the inputs, looked at first of all work, are not there either."""
+    (tmp_path / "file").write_text("of somebody")
+    asked = [word.format(free=tmp_path / "m.gpvo") for word in words]
+    code, [told] = main(capsys, monkeypatch, *asked, tmp_path / "file" / "deep" / "er")
+    assert code == 2
+    assert f"{tmp_path / 'file'} is no folder" in told
+
+
+def test_score_says_that_files_have_no_board(
+    capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    """``-o`` was ignored beside files."""
+    stated = ROOT / "docs" / "scoreboard" / "stated"
+    words = ["score", stated / "learned" / "unseen.txt", "--truth", stated / "truth" / "unseen.txt"]
+    code, [told] = main(capsys, monkeypatch, *words, "-o", tmp_path / "results")
+    assert code == 2
+    assert "-o has no effect on files" in told

@@ -110,6 +110,11 @@ def test_into_its_own_folder_and_with_its_own_truth(run: Path, tmp_path: Path) -
         ([], "give it with --truth"),
         (["--truth", "{truth}", "--frame", "body"], "--frame has no effect on a run"),
         (["--truth", "{truth}", "--map", "a=t_s"], "--map has no effect on a run"),
+        (["--truth", "{truth}", "--covariance-axes", "body"], "--covariance-axes has no effect on a run"),
+        (["--truth", "{truth}", "--covariance-of", "motion"], "--covariance-of has no effect on a run"),
+        (["--truth", "{truth}", "--vehicle", "car"], "--vehicle has no effect on a run"),
+        (["--truth", "{truth}", "--max-turn", "3"], "--max-turn has no effect on a run"),
+        (["--align", "transform", "--truth-topic", "/gt"], "--truth-topic has no effect without ground truth"),
         (["--truth", "{late}"], "--time-offset auto"),
     ],
 )
@@ -119,6 +124,30 @@ def test_refusals_leave_nothing(run: Path, tmp_path: Path, words: list[str], rea
     assert code != 0
     assert reason in err
     assert not (tmp_path / "out").exists()
+
+
+@pytest.mark.parametrize("words", [["--align", "rotation"], ["--truth-sigma", "0.01,0.01"], ["--truth-map", "a=t_s"]])
+def test_what_is_asked_of_a_truth_needs_one(tmp_path: Path, words: list[str]) -> None:
+    """Of a log, as of a run: it was ignored, and no truth was fitted."""
+    code, _, err = _call("import", _truth(tmp_path / "log.csv", 0.0), "-o", tmp_path / "out", *words)
+    assert code != 0
+    assert f"{words[0]} has no effect without ground truth (give it with --truth)" in err
+    assert not (tmp_path / "out").exists()
+
+
+def test_other_files_in_the_folder_of_a_run_stay(run: Path, tmp_path: Path) -> None:
+    """A note, a figure, a folder: what gpvo did not write it does not remove, whichever command replaces the run."""
+    (run / "notes.txt").write_text("battery changed")
+    (run / "figures").mkdir()
+    (run / "figures" / "a.txt").write_text("a")
+    truth = _truth(tmp_path / "mocap.csv", 0.0)
+    for words in (["import", run, "--truth", truth], ["import", truth, "--frame", "cam"]):
+        code, _, err = _call(*words, "-o", run, "--overwrite")
+        assert code == 0, err
+        assert (run / "notes.txt").read_text() == "battery changed"
+        assert (run / "figures" / "a.txt").read_text() == "a"
+    assert read_run(run).truth is None  # of the second one, of which nothing else was kept
+    assert sorted(p.name for p in tmp_path.iterdir()) == ["mine", "mocap.csv"]
 
 
 def test_a_run_that_broke_off_is_ended_first(run: Path, tmp_path: Path) -> None:

@@ -180,7 +180,7 @@ def test_gaps_and_bad_samples_are_said_but_not_fatal(flight: Flight) -> None:
     acc[5] = np.nan
     gappy = ImuLog(flight.imu.t_ns[keep], flight.imu.gyro_radps[keep], acc[keep], flight.imu.noise)
     found = require_sane(replace(flight, imu=gappy))
-    assert any("1 gaps in the IMU, the longest 0.5" in f.text for f in found)
+    assert any("1 gap in the IMU, the longest 0.5" in f.text for f in found)
     assert any("1 of" in f.text and "not finite" in f.text for f in found)
 
 

@@ -568,8 +568,8 @@ def test_poses_of_other_frames_are_left_out_or_refused_and_so_are_those_without_
     log = read_foreign(bag("few", {20, 30}))
     np.testing.assert_array_equal(log.t_ns, seq.stamps(40)[1:])
     np.testing.assert_allclose(log.trajectory.T_world_body, T[1:], atol=1e-9)
-    assert any("1 of 42 messages on '/odom' carry no stamp" in n for n in log.notes)
-    assert any("2 of 41 messages on '/odom' are of other frames" in n for n in log.notes)
+    assert any("left out: 1 of 42 messages on '/odom', without a stamp" in n for n in log.notes)
+    assert any("left out: 2 of 41 messages on '/odom', of other frames" in n for n in log.notes)
     with pytest.raises(SourceError, match="mixed on '/odom': odom to camera, and odom to base_link"):
         read_foreign(bag("half", range(40)))
 
@@ -601,7 +601,7 @@ def test_a_covariance_that_begins_with_zeros_is_stated_from_there_on(tmp_path):
     maker = _odometry_bag(True, twist=True, zeros=3)
     records, notes = to_records(read_foreign(maker.write(tmp_path / "a.bag")))
     assert [bool(r.covariances) for r in records] == [False] * 3 + [True] * 17
-    assert notes[-1] == "2 of 19 covariances are not positive definite and were left out"
+    assert notes[-1] == "left out: 2 of 19 covariances, not positive definite"
 
 
 def _stamped(tmp_path, stamps_s):
@@ -633,7 +633,7 @@ def test_one_wrong_stamp_costs_one_pose_of_a_bag_and_is_named_in_a_file(tmp_path
     log = read_foreign(_stamped(tmp_path, stamps_s))
     left = [s for k, s in enumerate(stamps_s) if is_order or k != where]
     np.testing.assert_allclose(log.t_ns * 1e-9, left)
-    note = "1 of 20 messages on '/odom' are stamped seconds off and were left out"
+    note = "left out: 1 of 20 messages on '/odom', stamped seconds off"
     assert (note in log.notes) is not is_order
     lines = tmp_path / "log.tum"
     lines.write_text("".join(f"{t:.9f} {k} 0 0 0 0 0 1\n" for k, t in enumerate(stamps_s)))
@@ -653,8 +653,8 @@ def test_messages_out_of_order_are_sorted_and_counted(tmp_path):
     log = read_foreign(_stamped(tmp_path, stamps_s))
     np.testing.assert_allclose(log.t_ns, np.arange(20) * 1e8)
     assert log.notes == (
-        "1 of 21 messages on '/odom' repeat a stamp and were left out",
-        "1 of 21 messages on '/odom' came out of order and were sorted by their stamps",
+        "left out: 1 of 21 messages on '/odom', with a repeated stamp",
+        "sorted by stamp: 1 of 21 messages on '/odom', which came out of order",
         "the covariances of its velocities are used, those of its poses are not",
     )
 
@@ -664,7 +664,7 @@ def test_poses_that_a_driver_publishes_twice_count_once(tmp_path):
     maker.messages[:] = [(t + j, *rest) for t, *rest in maker.messages for j in (0, 1)]
     log = read_foreign(maker.write(tmp_path / "a.bag"))
     assert len(log.t_ns) == 20
-    assert log.notes == ("20 of 40 messages on '/odom' repeat a stamp and were left out",)
+    assert log.notes == ("left out: 20 of 40 messages on '/odom', with a repeated stamp",)
 
 
 @pytest.mark.parametrize("kind", KINDS)
@@ -680,7 +680,7 @@ def test_messages_without_a_pose_are_left_out_as_the_lost_odometry_sends_them(tm
 
     path = _write(tmp_path, kind, maker_of)
     log = read_foreign(path)
-    assert log.notes[0] == "3 of 20 messages on '/odom' hold no valid pose and were left out"
+    assert log.notes[0] == "left out: 3 of 20 messages on '/odom', without a valid pose"
     T = seq.true_poses(20)
     np.testing.assert_allclose(to_records(log)[0][7].T_prev_cur, se3.inverse(T[6]) @ T[9], atol=1e-9)
     with pytest.raises(SourceError, match="message 8 on '/odom' holds no valid pose"):

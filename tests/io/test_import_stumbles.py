@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -14,6 +15,7 @@ from gpvo.cli.files import import_log
 from gpvo.errors import CalibrationError, SourceError
 from gpvo.io import open_source
 from gpvo.io.foreign import read_foreign
+from gpvo.io.run_read import read_run
 from gpvo.io.trajectory import read_tum
 
 POSE = "0,0,0,0,0,0,1"
@@ -114,6 +116,32 @@ def test_the_36_numbers_of_ros_by_their_place_in_the_row(name: str, tmp_path: Pa
     assert log.notes == ()
 
 
+@pytest.mark.parametrize("unit", ["_mm", " [mm]", "(cm)", "_km", "_m", " [ft]"])
+def test_positions_are_in_the_unit_of_their_column(unit: str, tmp_path: Path) -> None:
+    """They were read as metres where brackets named another unit, or ``--map`` the column."""
+    metres = {"mm": 1e-3, "cm": 1e-2, "km": 1e3, "m": 1.0, "ft": 0.3048}[unit.strip(" _[]()")]
+    rows = [f"{k * 0.1:.1f},{200.0 * k / metres!r},{-3.0 / metres!r},0,0,0,0,1" for k in range(5)]
+    names = [f"{a}{unit}" for a in "xyz"]
+    (tmp_path / "log.csv").write_text("\n".join([",".join(["t", *names, "qx,qy,qz,qw"]), *rows]))
+    for mapping in ({}, dict(zip(names, ("p_x", "p_y", "p_z")))):
+        log = read_foreign(tmp_path / "log.csv", mapping=mapping)
+        np.testing.assert_allclose(log.trajectory.T_world_body[4, :3, 3], [800, -3, 0], rtol=1e-12)
+        assert log.notes == ()
+
+
+def test_covariances_are_in_the_unit_of_their_column(tmp_path: Path) -> None:
+    """As logged in millimetres and degrees, squared; those of unnamed units beside such positions are remarked."""
+    names = [f"var_{a} [mm^2]" for a in "xyz"] + [f"var_{a}_deg2" for a in ("roll", "pitch", "yaw")]
+    log = read_foreign(_csv(tmp_path / "log.csv", ",".join(names), "1,4,9,1,4,9"))
+    degree = np.pi / 180
+    assert log.covariance is not None
+    np.testing.assert_allclose(np.sqrt(np.diagonal(log.covariance[0])), [1e-3, 2e-3, 3e-3, *degree * np.arange(1, 4)])
+    path = _csv(tmp_path / "mixed.csv", "cov_xx,cov_yy,cov_zz,cov_rollroll,cov_pitchpitch,cov_yawyaw", "1,2,3,4,5,6")
+    path.write_text(path.read_text().replace(",x,", ",x_mm,", 1))
+    [note] = read_foreign(path).notes
+    assert "x_mm is converted to metres, the covariances, which name no unit, are not" in note
+
+
 def test_of_a_twist_they_are_not_the_poses(tmp_path: Path) -> None:
     names = ",".join(f"twist.covariance[{k}]" for k in range(36))
     log = read_foreign(_csv(tmp_path / "log.csv", names, ",".join(["1"] * 36)))
@@ -132,7 +160,7 @@ def test_what_stands_for_no_number_costs_its_row_alone(word: str, tmp_path: Path
     path.write_text(f"{HEAD}\n0.0,{POSE}\n0.1,0,{word},0,0,0,0,1\n0.2,{POSE}\n")
     log = read_foreign(path)
     np.testing.assert_array_equal(log.t_ns, [0, 200_000_000])
-    assert log.notes == ("1 rows without a pose were left out",)
+    assert log.notes == ("left out: 1 row without a pose",)
 
 
 @pytest.mark.parametrize(
@@ -178,3 +206,78 @@ def test_an_uncertainty_that_nothing_reads_is_named(names: str, tmp_path: Path) 
     more = ",0.01" * len(names.split(","))
     path.write_text(f"{HEAD},{names}\n0.0,{POSE}{more}\n0.1,{POSE}{more}\n")
     assert any(f"columns not used: {names.replace(',', ', ')};" in note for note in read_foreign(path).notes)
+
+
+@pytest.mark.parametrize("name", ["log.tum", "log.csv"])
+def test_a_file_that_breaks_off_in_a_line_is_told_from_one_of_another_kind(name: str, tmp_path: Path) -> None:
+    """As of a full disk or a kill: the cure is that line, not another command."""
+    separator, path = "," if name.endswith("csv") else " ", tmp_path / name
+    lines = [separator.join([f"{k * 0.1:.1f}", *POSE.split(",")]) for k in range(5)]
+    head = ["t,x,y,z,qx,qy,qz,qw"] * (separator == ",")
+    path.write_text("\n".join([*head, *lines])[:-5])
+    with pytest.raises(SourceError, match="the file breaks off in this line: remove it"):
+        read_foreign(path)
+    short = lines[2][:-5]
+    path.write_text("\n".join([*head, *lines[:2], short, *lines[3:]]))
+    with pytest.raises(SourceError) as raised:
+        read_foreign(path)
+    assert "breaks off" not in str(raised.value)
+
+
+def test_poses_alone_are_sent_to_import(tmp_path: Path) -> None:
+    """What has no images is no sequence, and no run yet: each refusal said how to make a run of images."""
+    maker = BagMaker(ros1=False)
+    for t, T in zip(seq.stamps(12), seq.true_poses(12), strict=True):
+        maker.odometry("/wheels/odom", t, T, np.eye(6), np.eye(6))
+    bag = maker.write(tmp_path / "bag")
+    log = _csv(tmp_path / "log.csv", "a", "1")
+    for path in (bag, log):
+        with pytest.raises(SourceError, match="'gpvo import'"):
+            open_source(path)
+        with pytest.raises(SourceError, match="or 'gpvo import' of poses"):
+            read_run(path)
+
+
+@pytest.mark.parametrize(
+    "names", ["q0,q1,q2,q3", "q[0],q[1],q[2],q[3]", "pose.quat_0,pose.quat_1,pose.quat_2,pose.quat_3"]
+)
+def test_numbered_quaternions_are_asked_about(names: str, tmp_path: Path) -> None:
+    """PX4 and Hamilton put w first, ROS last: to map the first one to q_x, as was advised, is wrong for PX4."""
+    path = tmp_path / "log.csv"
+    rows = [f"{k * 0.1:.1f},0,0,0,1,0,0,0" for k in range(5)]
+    path.write_text("\n".join([f"t,x,y,z,{names}", *rows]) + "\n")
+    with pytest.raises(SourceError, match="which is w") as raised:
+        read_foreign(path)
+    columns = names.split(",")
+    assert f"'{columns[0]}=q_w'" in str(raised.value)
+    mapping = dict(zip(columns, ("q_w", "q_x", "q_y", "q_z")))
+    np.testing.assert_array_equal(
+        read_foreign(path, mapping=mapping).trajectory.T_world_body[:, :3, :3], [np.eye(3)] * 5
+    )
+
+
+@pytest.mark.parametrize("name", ["Rot {}", "quaternion.{}", "orientation_{}", "pose/quaternion/{}"])
+def test_quaternions_by_their_usual_names(name: str, tmp_path: Path) -> None:
+    path = tmp_path / "log.csv"
+    names = ",".join(name.format(a) for a in "WXYZ")
+    path.write_text("\n".join([f"Time,Pos X,Pos Y,Pos Z,{names}", *(f"{k * 0.1:.1f},1,2,3,1,0,0,0" for k in range(5))]))
+    T = read_foreign(path).trajectory.T_world_body
+    np.testing.assert_array_equal(T[2], [[1, 0, 0, 1], [0, 1, 0, 2], [0, 0, 1, 3], [0, 0, 0, 1]])
+
+
+@pytest.mark.parametrize(
+    ("given", "named"),
+    [
+        ({"mapping": {"a": "p_x"}}, "--map"),
+        ({"topic": "/odom"}, "--topic"),
+        ({"covariance_of": "motion"}, "--covariance-of motion"),
+        ({"covariance_axes": "body"}, "--covariance-axes"),
+    ],
+)
+def test_what_a_format_does_not_read_is_refused(given: dict[str, Any], named: str, tmp_path: Path) -> None:
+    """It was ignored: a TUM file has no columns to map, no topic and no covariances."""
+    path = tmp_path / "log.tum"
+    path.write_text("".join(f"{k * 0.1:.1f} 0 0 0 0 0 0 1\n" for k in range(5)))
+    with pytest.raises(SourceError, match=rf"{named} has no effect on this file .tum."):
+        read_foreign(path, **given)
+    assert len(read_foreign(path, covariance_of="pose").t_ns) == 5

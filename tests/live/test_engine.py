@@ -115,6 +115,26 @@ def _of_a_planar_robot(
     return records, to_records(log.seen_from(place))[0]
 
 
+@pytest.mark.parametrize("axes", ["auto", "world", "body", "mixed"])
+def test_covariances_of_poses_in_any_axes_as_in_an_import(axes: str, tmp_path: Path) -> None:
+    """Each motion's own is what comes out, however the growing one of the pose is stated: OpenVINS' is mixed."""
+    rng, T, C, zero = np.random.default_rng(3), np.eye(4), np.zeros((6, 6)), np.zeros((6, 6))
+    root = 1e-3 * rng.standard_normal((6, 6))
+    own, maker, live = root @ root.T + 1e-7 * np.eye(6), BagMaker(ros1=False), PoseStage(TOPIC, np.eye(4), axes)
+    for k in range(60):
+        of_rotation = np.eye(3) if axes == "mixed" else None
+        stated = C if axes == "body" else rotate_covariance(T[:3, :3], C, of_rotation)
+        maker.odometry(TOPIC, 10**18 + k * 50_000_000, T, stated, zero, "base_link")
+        motion = se3.exp(np.array([0.3, 0.1, 0.0, 0.1, -0.2, 0.3]) + 0.05 * rng.standard_normal(6))
+        A = se3.adjoint(se3.inverse(motion))
+        T, C = T @ motion, A @ C @ A.T + own
+    log = read_foreign(maker.write(tmp_path / "vio"), topic=TOPIC, covariance_axes=axes)
+    records = [taken.record for t, topic, m in maker.messages for taken in live.take(Arrival(topic, m, t))]
+    for ours, imported in zip(records[2:], to_records(log)[0][2:], strict=True):
+        np.testing.assert_allclose(ours.covariances["imported"], own, rtol=0, atol=1e-9)
+        np.testing.assert_allclose(imported.covariances["imported"], own, rtol=0, atol=1e-9)
+
+
 @pytest.mark.parametrize("tilt_rad", [0.0, 1e-16, 1e-9, 1e-7])
 @pytest.mark.parametrize("of", ["twist", "pose"])
 def test_a_robot_in_a_plane_states_three_axes_as_in_an_import(of: str, tilt_rad: float, tmp_path: Path) -> None:

@@ -61,7 +61,7 @@ def test_frames_that_their_quality_forbids_are_counted(predicted: Path, tmp_path
     write_run(tmp_path / "far", VoLog(records), predictions=stored, meta={"source": "made"})
     told = publish_run(tmp_path / "far", PublishSettings(check=True, consumer="ardupilot"))
     assert (told.document()["lost"], told.document()["outside"]) == (1, 2)
-    assert "1 lost frames, 2 far outside the model's domain" in str(told)
+    assert "1 lost frame, 2 far outside the model's domain" in str(told)
     assert "outside" not in str(publish_run(predicted, PublishSettings(check=True)))
 
 

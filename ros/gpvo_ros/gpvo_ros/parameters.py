@@ -30,6 +30,9 @@ PARAMETERS = {
     "model": Parameter("", "Error model of this camera, or of this odometry: a .gpvo file."),
     "odometry": Parameter("", "Topic of another odometry, to be republished with an honest covariance ..."),
     "odometry_type": Parameter("odometry", "Type of that topic.", choices=tuple(POSE_TYPE_NAMES)),
+    "covariance_axes": Parameter(
+        "auto", "Axes of the covariances of its poses; mixed for OpenVINS.", choices=("auto", "world", "body", "mixed")
+    ),
     "left": Parameter("", "... or topics of a stereo pair, raw or rectified, whole or compressed."),
     "right": Parameter("", "The other topic of the pair."),
     "imu": Parameter("", "Topic of the IMU, beside a stereo pair."),
@@ -66,8 +69,8 @@ PARAMETERS = {
 
 
 _AS_THEY_ARE = (
-    "imu", "odometry", "odometry_type", "truth", "truth_type", "base_frame", "mavlink", "px4", "topic", "pose_topic",
-    "pose_covariance", "depth",
+    "imu", "odometry", "odometry_type", "covariance_axes", "truth", "truth_type", "base_frame", "mavlink", "px4",
+    "topic", "pose_topic", "pose_covariance", "depth",
 )  # fmt: skip
 
 
