@@ -28,7 +28,6 @@ from gpvo.types import Array, MotionError, Prediction, Status, VoRecord
 
 _GUESS_NS = 250_000_000  # longest step of a guess
 _SILENCE_NS, _LONGEST_SILENCE_S = 4_000_000_000, 1e3  # without sample and record: no guess holds so long
-_CLOCK_NS = 150_000_000  # shorter gaps no clock made
 _STEPS, _MOST_RIVALS = 5, 2  # of records, by which the usual one is told; clocks that may have been set at once
 _SLOWEST_NS = 20_000_000_000  # records are no further apart, where nothing else is heard
 _LONGEST_STEP_NS, _LONGEST_GAP_NS = round(LONGEST_STEP_S * 1e9), round(LONGEST_GAP_S * 1e9)
@@ -355,7 +354,7 @@ class Timeline:
             dt, ends = (t1 - t) * 1e-9, np.array([sample, after])
             over = self._imu.over_gap(i, t, t1, ends)
             ends = ends if over is None else over[0]
-            if may_be_set and over is not None and t >= resumed_ns and heard_ns - t > _CLOCK_NS:
+            if may_be_set and over is not None and t >= resumed_ns:
                 unmoved, resumed_ns = filter.copy(), heard_ns
             filter.propagate_imu(dt, ends[:1, :3], ends[:1, 3:], ends[1:, :3], ends[1:, 3:])
             if over is not None:

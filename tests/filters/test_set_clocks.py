@@ -5,6 +5,7 @@ from __future__ import annotations
 import copy
 from dataclasses import replace
 from functools import cache
+from itertools import product
 
 import numpy as np
 import pytest
@@ -102,9 +103,14 @@ def test_a_clock_that_is_set_alone_changes_nothing(clock: str, shift_s: float, a
     _ends_alike(found, _usual(5))
 
 
-@pytest.mark.parametrize("silence_s", [0.2, 1.0, 3.0])
-@pytest.mark.parametrize("who", ["vo, lost", "vo, one long motion", "imu"])
-def test_a_silence_of_one_of_them_is_no_clock_that_was_set(who: str, silence_s: float) -> None:
+@pytest.mark.parametrize(
+    ("who", "silence_s"),
+    [
+        *product(["vo, lost", "vo, one long motion", "imu"], [0.2, 1.0, 3.0]),
+        *product(["both, lost", "both, one long motion"], [0.05, 0.1, 0.2, 1.0]),
+    ],
+)
+def test_a_silence_is_no_clock_that_was_set(who: str, silence_s: float) -> None:
     for seed in range(3):
         flight, imu_ns, begin_ns = _flight(seed)
         imu = flight.imu
@@ -115,7 +121,7 @@ def test_a_silence_of_one_of_them_is_no_clock_that_was_set(who: str, silence_s: 
         came = np.searchsorted(imu_ns, ends, side="right")
         for k, record in enumerate(flight.records[first:], first):
             for i in range(came[k - 1], came[k]):
-                if who != "imu" or not begin_ns < imu_ns[i] <= end_ns:
+                if who.startswith("vo") or not begin_ns < imu_ns[i] <= end_ns:
                     timeline.add_imu(int(imu_ns[i]), imu.gyro_radps[i], imu.acc_mps2[i])
             if who != "imu" and begin_ns < record.t_ns <= end_ns:
                 continue

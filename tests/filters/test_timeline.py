@@ -200,7 +200,7 @@ def test_a_silence_of_camera_and_imu_is_as_uncertain_as_it_is(silence_s: float, 
     assert np.median(later, axis=0).max() < 3 * most
 
 
-@pytest.mark.parametrize("back_s", [0.1, 0.6, 1.2, 3.0, 3600.0, -0.5, -2.0, -3.9, -5.0, -30.0, -3600.0])
+@pytest.mark.parametrize("back_s", [0.1, 0.6, 1.2, 3.0, 3600.0, -0.05, -0.1, -0.5, -2.0, -3.9, -5.0, -30.0, -3600.0])
 @pytest.mark.parametrize("late", [0, 2])
 def test_the_filter_goes_on_when_the_clock_is_set_back_or_ahead(flight: Flight, back_s: float, late: int) -> None:
     """``late``: records that are on their way then."""
