@@ -162,7 +162,7 @@ def build(
     if odd == "drop":
         known &= ~is_odd
     if known.sum() < MIN_ROWS:
-        what = f"only {int(known.sum())} motions have ground truth, {MIN_ROWS} are needed"
+        what = f"only {int(known.sum())} of {max(len(log) - 1, 0)} motions have ground truth, {MIN_ROWS} are needed"
         cure = "check that log and truth share one clock"
         if (measured := int(seen.usable.sum())) < MIN_ROWS:
             what = f"only {measured} of {max(len(log) - 1, 0)} motions were measured, {MIN_ROWS} are needed"

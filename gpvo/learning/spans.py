@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from gpvo.errors import GpvoError
 from gpvo.stats.series import moving_sums
 from gpvo.types import Array
 
@@ -17,7 +18,7 @@ Chains = Sequence[Sequence[NDArray[Any]]]
 
 SPANS = (1, 2, 5, 10, 20, 50, 100, 200, 500, 1000, 2000, 5000)
 _MIN_WINDOWS, _MAX_DOUBT = 3.0, 1.0
-_SAME_NS = 1000
+_SAME_NS, _LEAST = 1000, 12
 
 
 @dataclass(frozen=True)
@@ -58,7 +59,13 @@ def cut(values: NDArray[Any], m: int) -> NDArray[Any]:
 
 
 def span_variances(z: Chains) -> SpanVariances:
-    """Of the sums over each of :data:`SPANS` that occurs three times at least; sequences count by their length."""
+    """Of the sums over each of :data:`SPANS` that occurs three times at least; sequences count by their length.
+
+    Raises GpvoError for fewer motions than tell how six axes are correlated.
+    """
+    if sum(len(chain) for chains in z for chain in chains) < _LEAST:
+        what = "too few motions begin where one before ends, as of a vehicle that hardly moves"
+        raise GpvoError(what, cure="train on runs in which it moves")
     spans, mean_square, doubt = [], [], []
     for m in SPANS:
         long = [[chain for chain in chains if len(chain) >= m] for chains in z]
@@ -73,8 +80,6 @@ def span_variances(z: Chains) -> SpanVariances:
             spans.append(m)
             mean_square.append(mean)
             doubt.append(np.clip(by_block(between), 2.0 / windows.sum(), _MAX_DOUBT))
-    if not spans:
-        raise ValueError("no residuals to fit the parts to")
     return SpanVariances(np.array(spans), np.array(mean_square), np.array(doubt))
 
 

@@ -750,3 +750,10 @@ def test_a_model_that_could_not_be_loaded_is_not_made() -> None:
     sets = training_sets(range(4), n=120)
     with pytest.raises(GpvoError, match="differ so much from run to run.*factor'"):
         train_sets([replace(s, Y=s.Y * scale) for s, scale in zip(sets, (1.0, 1.0, 1e6, 1e6))], QUICK, judge=False)
+
+
+def test_a_vehicle_that_never_leads_on_teaches_nothing_of_how_errors_add_up():
+    """At rest, all motions begin at one keyframe."""
+    resting = [replace(s, dt_s=0.05 + 1e-9 * (s.t_ns - s.t_ns[0])) for s in training_sets(range(3), n=120)]
+    with pytest.raises(GpvoError, match="a vehicle that hardly moves"):
+        train_sets(resting, QUICK, judge=False)
