@@ -58,11 +58,17 @@ class TruthNoise:
         return np.sqrt(self.sigma**2 + self.jitter_s**2 * way2)
 
 
+def of_errors(errors: MotionErrors, log: VoLog, of_poses: Array) -> Array:
+    """(M, 6, 6) covariance that the noise ``of_poses`` (N, 6, 6) at the frames adds to the errors of motions:
+    ``S_end + Ad(T)^-1 S_start Ad(T)^-T``. Where the log does not hold the start, its noise is that of the end."""
+    start = log.parent[errors.index]
+    return compound(errors.T_true, of_poses[np.where(start < 0, errors.index, start)], of_poses[errors.index])
+
+
 def of_stamps(
     noise: TruthNoise, log: VoLog, truth: TruthLog, t_prev_ns: NDArray[np.int64], t_ns: NDArray[np.int64]
 ) -> Array:
-    """(n, 6, 6) covariance that the noise of two poses adds to the error of the motion between them, for motions
-    between stamps (n,) of frames of the log: ``S_end + Ad(T)^-1 S_start Ad(T)^-T``."""
+    """(n, 6, 6) the same for motions between stamps (n,) of frames of the log."""
     T, known = interpolate_truth(truth, log.t_ns)
     of_poses = noise.of_poses(rates_of(T, log.t_ns, known))
     start, end = (np.searchsorted(log.t_ns, t).clip(max=len(T) - 1) for t in (t_prev_ns, t_ns))

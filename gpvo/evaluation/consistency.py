@@ -100,11 +100,12 @@ class Consistency:
 
 def consistency(
     statement: Statement, errors: MotionErrors, log: VoLog, T_true: Array, known: NDArray[np.bool_],
-    noise: Array | None = None, by_velocity: Array | None = None,
+    noise: tuple[Array, Array] | None = None, by_velocity: Array | None = None,
 ) -> Consistency | None:  # fmt: skip
     """Scores of one method, None where it says nothing about any motion with truth.
 
-    ``T_true`` (N, 4, 4) and ``known`` (N,): truth at the log's stamps. ``noise`` (N, 6, 6): covariance of these.
+    ``T_true`` (N, 4, 4) and ``known`` (N,): truth at the log's stamps. ``noise``: covariance of these
+    (N, 6, 6), and what that adds to errors (M, 6, 6).
     ``by_velocity`` (N, 3): where the truth's own velocities lead (:func:`gpvo.dataset.truth_noise.velocity_path`).
     """
     C = statement.covariance[errors.index]
@@ -117,7 +118,7 @@ def consistency(
     per_block = nees_by_block(e, C, axes)
     if noise is not None:
         # From here on, errors are those of odometry and of the truth.
-        C = C + compound(errors.T_true[stated], noise[_starts(index, log)], noise[index])[:, :d, :d]
+        C = C + noise[1][stated, :d, :d]
     with_noise = nees_by_block(e, C, axes)
     scores = score(errors.xi[stated], statement.mean[index], C, statement.nu, axes)
     energy = {unit: _energy(e, C, axes[np.isin(axes, BLOCKS[block])]) for unit, block in UNITS.items()}
@@ -127,7 +128,7 @@ def consistency(
     progress = se3.path_length_m(T_true[:, :3, 3]), (log.t_ns - log.t_ns[0]) * 1e-9
 
     def over(along: Array, span: float) -> Horizon:
-        return horizon(statement, log, T_true, known, along, span, noise, by_velocity, axes)
+        return horizon(statement, log, T_true, known, along, span, noise and noise[0], by_velocity, axes)
 
     return Consistency(
         method=statement.method,
@@ -144,12 +145,6 @@ def consistency(
         one_second=over(progress[1], 1.0) if d == 6 else None,
         horizons=tuple(over(progress[0], m) for m in HORIZONS_M if d == 6),
     )
-
-
-def _starts(index: NDArray[np.int64], log: VoLog) -> NDArray[np.int64]:
-    """(M,) frames where motions ``index`` (M,) start; where the log does not hold one, that where it ends."""
-    parent = log.parent[index]
-    return np.where(parent < 0, index, parent)
 
 
 def _energy(error: Array, covariance: Array, axes: NDArray[np.intp]) -> float | None:

@@ -24,7 +24,14 @@ from gpvo.dataset.errors import (
     turn_without_truth_deg,
 )
 from gpvo.dataset.misread import FixedRotation, InversePoses, Misread, Resemblance, late_by
-from gpvo.dataset.truth_noise import TruthNoise, estimate_truth_noise, rates_of, telling_distance_m, velocity_path
+from gpvo.dataset.truth_noise import (
+    TruthNoise,
+    estimate_truth_noise,
+    of_errors,
+    rates_of,
+    telling_distance_m,
+    velocity_path,
+)
 from gpvo.errors import NO_TRUTH, SourceError
 from gpvo.evaluation.consistency import BY_MODEL, Consistency, consistency
 from gpvo.evaluation.statements import Statement, statements
@@ -58,12 +65,13 @@ class Evaluation:
     stands, or jumps. ``odd``: these jumps, and stretches in which odometry and truth differ far more than elsewhere.
     ``truth_sigma`` (6,): noise of the truth's poses by axis, as counted in, root mean square over the run;
     ``truth_sigma_stated`` (6,): as its source states; ``truth_jitter_s``: jitter of its stamps, of which the former
-    holds what it makes of the poses. ``tells_from_m``: length of path from which odometry's errors outweigh it.
-    ``late_s``: offset between the clocks, where it matters and none was given; ``turned``: a fixed rotation between
-    truth and odometry, likewise; ``inverse``: poses of one of the two seem to be inverse; ``unlike``: how little the
-    two resemble each other, where they do not. ``in_domain``: share of the predicted frames that lie in the model's
-    training domain, None without a model. ``misfits``: why else the model does not fit the run, or cannot be judged by
-    it. ``poses``: scores of the covariances of poses that a log states.
+    holds what it makes of the poses; ``truth_noise`` (M, 6, 6): what both add to the errors, None for nothing.
+    ``tells_from_m``: length of path from which odometry's errors outweigh it. ``late_s``: offset between the clocks,
+    where it matters and none was given; ``turned``: a fixed rotation between truth and odometry, likewise; ``inverse``:
+    poses of one of the two seem to be inverse; ``unlike``: how little the two resemble each other, where they do not.
+    ``in_domain``: share of the predicted frames that lie in the model's training domain, None without a model.
+    ``misfits``: why else the model does not fit the run, or cannot be judged by it. ``poses``: scores of the
+    covariances of poses that a log states.
     """
 
     run: Run
@@ -77,6 +85,7 @@ class Evaluation:
     truth_sigma: Array = field(default_factory=lambda: np.zeros(6))
     truth_sigma_stated: Array = field(default_factory=lambda: np.zeros(6))
     truth_jitter_s: float = 0.0
+    truth_noise: Array | None = None
     time_offset_s: float = 0.0
     tells_from_m: float = 0.0
     turned: FixedRotation | None = None
@@ -155,7 +164,9 @@ def evaluate_run(
         shown = estimate_truth_noise(errors, scored)
         least = np.maximum(stated, interpolation_sigma(truth, log.t_ns))
         noise = replace(shown, sigma=np.maximum(shown.sigma, least))
-    sigma = noise.usual(rates[known])
+    sigma, added = noise.usual(rates[known]), None
+    if sigma.any():
+        added = (noise.of_poses(rates), of_errors(errors, scored, noise.of_poses(rates)))
     late_s = late_by(scored, truth) if options.time_offset_s == 0.0 else None
     on_its_clock = on_clock_of_log(truth, late_s) if late_s else truth
     misread = Misread.of(scored, on_its_clock)
@@ -168,7 +179,7 @@ def evaluate_run(
         log=scored,
         T_true=T_true,
         known=known,
-        noise=noise.of_poses(rates) if sigma.any() else None,
+        noise=added,
         by_velocity=by_velocity,
     )
     found = list(map(judge, made))  # each statement is let go before the next
@@ -191,6 +202,7 @@ def evaluate_run(
         truth_sigma=sigma,
         truth_sigma_stated=stated,
         truth_jitter_s=noise.jitter_s,
+        truth_noise=added and added[1],
         tells_from_m=telling_distance_m(scored, T_true, known, sigma),
         turned=misread.turned if options.align == "none" else None,
         inverse=misread.inverse,

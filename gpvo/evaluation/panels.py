@@ -101,7 +101,8 @@ def errors(e: Evaluation) -> list[Panel]:
         error, bands = 1e3 * e.errors.xi[:, k], []
         reach = max(1.3 * float(np.quantile(np.abs(error), 0.995)), 1e-6)
         if statement is not None:
-            mean, bound = 1e3 * statement.mean[index, k], 3e3 * np.sqrt(statement.covariance[index, k, k])
+            own = 0.0 if e.truth_noise is None else e.truth_noise[:, k, k]
+            mean, bound = 1e3 * statement.mean[index, k], 3e3 * np.sqrt(statement.covariance[index, k, k] + own)
             low, high = (mean - bound)[keep], (mean + bound)[keep]
             bands = [{"x": _rounded(t[keep]), "low": _rounded(low), "high": _rounded(high), "colour": _GREEN}]
             # Nine tenths of the bound are always in the plot; its peaks unless the error would be a flat line.
@@ -156,13 +157,15 @@ def nees(e: Evaluation) -> list[Panel]:
 
 def _stated_errors(e: Evaluation) -> Iterator[tuple[Statement, Array, Array, Array]]:
     """Of each method that speaks of all axes of at least two motions with truth: itself, the errors about its mean on
-    the d axes that count (K, d), the covariances (K, d, d) and the times [s] of these motions."""
+    the d axes that count (K, d), the covariances (K, d, d), with the truth's noise, and the times [s] of these
+    motions."""
     for s in e.statements:
         known = np.isfinite(s.covariance[e.errors.index]).all(axis=(1, 2))
         if s.errors is not None and known.sum() >= 2:
             axes, index = np.array(e.consistency[s.method].axes), e.errors.index[known]
             error = (e.errors.xi[known] - s.mean[index])[:, axes]
-            yield s, error, consistency.marginal(s.covariance[index], axes), e.t_s[index]
+            C = s.covariance[index] if e.truth_noise is None else s.covariance[index] + e.truth_noise[known]
+            yield s, error, consistency.marginal(C, axes), e.t_s[index]
 
 
 def memory(e: Evaluation) -> list[Panel]:
@@ -277,9 +280,10 @@ GROUPS: dict[tuple[str, str], tuple[Drawing, ...]] = {
     ("Top and side view", "Green: 3-sigma ellipses of {method}."): (
         Drawing(views, "trajectory", "top and side view, 3-sigma ellipses of {method}", (9, 9)),
     ),
-    ("Error of each motion and its bound", "Line: error. Green: three standard deviations as stated by {method}."): (
-        Drawing(errors, "errors", "error per motion and 3-sigma bound of {method}", (10, 7), 2, True),
-    ),
+    (
+        "Error of each motion and its bound",
+        "Line: error. Green: three standard deviations as stated by {method}, with the truth's noise.",
+    ): (Drawing(errors, "errors", "error per motion and 3-sigma bound of {method}", (10, 7), 2, True),),
     ("What each method states", "The standard deviation of each motion, per axis."): (Drawing(stated),),
     (
         "Is it honest?",

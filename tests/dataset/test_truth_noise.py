@@ -21,6 +21,7 @@ from gpvo.dataset.truth_noise import (
     telling_distance_m,
 )
 from gpvo.errors import SourceError
+from gpvo.evaluation import panels
 from gpvo.evaluation.evaluate import evaluate_run
 from gpvo.evaluation.verdict import verdict
 from gpvo.geometry import se3
@@ -335,3 +336,16 @@ def test_what_is_said_of_a_noisy_truth(flights):
     found = evaluate_run(replace(flights[4], truth=noisy(flights[4].truth, 1, 0.0, 0.0, 0.02)))
     assert 0.017 < found.truth_jitter_s < 0.024
     assert f"its stamps jitter by {1e3 * found.truth_jitter_s:.2g} ms" in " ".join(verdict(found).lines)
+
+
+def test_pictures_show_errors_beside_what_is_stated_of_both(flights):
+    """Odometry's and the truth's: else every honest covariance would seem overconfident."""
+    e = evaluate_run(replace(flights[4], truth=noisy(flights[4].truth, 1, 0.02, 0.002)))
+    c = e.consistency["triangulation"]
+    (over_time,) = panels.nees(e)
+    drawn = next(line for line in over_time["lines"] if line["name"] == "triangulation")
+    assert np.mean(drawn["y"]) == pytest.approx(c.nees_dof_truth_noise["joint"], rel=0.1)
+    assert c.nees_dof["joint"].mean > 3.0 * c.nees_dof_truth_noise["joint"]
+    for axis, one in enumerate(panels.errors(e)):
+        (band,) = one["bands"]
+        assert np.mean(np.subtract(band["high"], band["low"])) > 2 * 3e3 * np.sqrt(2.0) * e.truth_sigma[axis]

@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 from evaluation_runs import make_run, stated_covariance
 from gpvo.dataset.errors import interpolate_truth, motion_errors
-from gpvo.dataset.truth_noise import TruthNoise
+from gpvo.dataset.truth_noise import TruthNoise, of_errors
 from gpvo.evaluation import consistency as module
 from gpvo.evaluation.consistency import Consistency, consistency, horizon
 from gpvo.evaluation.statements import Statement, predicted_statement, statements
@@ -28,7 +28,8 @@ MODEL = Path(__file__).parents[2] / "models" / "tunnel.gpvo"
 def _scores(log: VoLog, truth: TruthLog, sigma: tuple[float, float] = (0.0, 0.0)) -> dict[str, Consistency]:
     T_true, known = interpolate_truth(truth, log.t_ns)
     errors = motion_errors(log, truth)
-    noise = TruthNoise(np.repeat(sigma, 3)).of_poses(np.zeros((len(log), 6)))
+    of_poses = TruthNoise(np.repeat(sigma, 3)).of_poses(np.zeros((len(log), 6)))
+    noise = of_poses, of_errors(errors, log, of_poses)
     found = {s.method: consistency(s, errors, log, T_true, known, noise) for s in statements(log)}
     return {m: c for m, c in found.items() if c is not None}
 
