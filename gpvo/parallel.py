@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import signal
 import warnings
 from collections import deque
@@ -59,6 +60,8 @@ def map_jobs(
 
     from joblib import Parallel, delayed
 
+    # Of a process that a signal ends, workers and their tracker may both remove a semaphore: no matter to anybody.
+    os.environ.setdefault("PYTHONWARNINGS", "ignore:resource_tracker:UserWarning")
     calls = (delayed(function)(*arguments) for arguments in jobs_arguments)
     with warnings.catch_warnings():
         # A process that has grown is renewed between two jobs: nothing is lost, and nothing is to be done about it.
