@@ -25,6 +25,7 @@ _NEGLIGIBLE = 1e-3
 """Of odometry's errors, as noise where there is none: what is exact has no information matrix."""
 _FARTHEST = 20
 """References between the ends of a motion. Odometry begins at the last one; what a log says beyond it is no chain."""
+_ABSURD = 1e4  # times the median error: of no use, and beyond the algebra
 _D = 6
 Frames = NDArray[np.int64]
 
@@ -48,11 +49,12 @@ def drawn_without_noise(log: VoLog, truth: TruthLog, noise: TruthNoise, seed: in
     start, end = log.parent[errors.index], errors.index
     inner = np.unique(start)
     near = (start >= 0) & (np.searchsorted(inner, end) - np.searchsorted(inner, start) <= _FARTHEST)
+    near &= ~errors.far(_ABSURD)
     if near.sum() < _D:
         return truth
     T, known = interpolate_truth(truth, log.t_ns)
-    prior = noise.of_poses(rates_of(T, log.t_ns, known)) + np.diag(_least(errors.xi) ** 2)
     errors, start, end = errors.rows(near), start[near], end[near]
+    prior = noise.of_poses(rates_of(T, log.t_ns, known)) + np.diag(_least(errors.xi) ** 2)
     off = _Chain(errors, start, end, prior, _shape(log, end)).draw(np.random.default_rng(seed))
     return TruthLog(log.t_ns[known], (T @ se3.exp(-off))[known])
 

@@ -146,13 +146,14 @@ def _jitter_variance(told: Array, lacks: Array, way2: Array, good: NDArray[np.bo
     part that truth and odometry share changes with the velocity.
     """
     n, k = told.shape
+    told, lacks = (np.where(good, x, 0.0) for x in (told, lacks))
     product = told * lacks / _GAIN
     X = np.concatenate([way2[:, :, None], np.broadcast_to(np.eye(k), (n, k, k))], axis=2)
     X, stated, kept = np.where(good[:, :, None], X, 0.0), np.zeros((n, k)), np.maximum(good.sum(axis=0), 1)
     for _ in range(_ROUNDS):
         both = _GAIN * stated
         usual = (good * both).sum(axis=0) / kept
-        own = [np.maximum((good * x**2).sum(axis=0) / kept - usual, 0.0) for x in (told, lacks)]
+        own = [np.maximum((x**2).sum(axis=0) / kept - usual, 0.0) for x in (told, lacks)]
         spread = np.sqrt((both + own[0]) * (both + own[1]) + both**2) / _GAIN
         spread = np.maximum(spread, _LEAST_SPREAD * spread.mean(axis=0))
         A, y = (X / spread[:, :, None]).reshape(n * k, k + 1), (product / spread).ravel()

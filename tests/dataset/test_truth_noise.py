@@ -278,6 +278,18 @@ def test_the_same_truth_gives_the_same_draw_and_a_slip_stays_odometrys(flights):
     assert found.xi[found.index == 100][0, 2] == pytest.approx(0.5, abs=0.05)
 
 
+def test_an_absurd_motion_changes_nothing_for_the_others(flights):
+    run = flights[4]
+    told, far = noisy(run.truth, 3, 0.01, 0.001, 0.01), se3.exp(np.array([0.0, 0.0, 1e100, 0.0, 0.0, 0.0]))
+    log = VoLog(
+        [replace(r, T_prev_cur=r.T_prev_cur @ far) if k == 100 else r for k, r in enumerate(run.log)], run.log.camera
+    )
+    found, usual = (without_noise(of, told) for of in (log, run.log))
+    assert found[1].jitter_s == pytest.approx(usual[1].jitter_s, rel=0.1)
+    np.testing.assert_allclose(found[1].sigma, usual[1].sigma, rtol=0.1)
+    assert np.isfinite(found[0].T_world_cam).all()
+
+
 def test_motions_from_long_ago_and_too_few_of_them_are_no_chain():
     t_ns = np.arange(3000) * 10**8
     records = [VoRecord(int(t), int(t) - 10**8 if k % 7 else 0, Status.OK if k else Status.START, np.eye(4))
