@@ -28,7 +28,8 @@ from gpvo.geometry import se3
 from gpvo.io.run import write_run
 from gpvo.io.run_read import Run, read_run
 from gpvo.learning.config import TrainConfig
-from gpvo.learning.train import train_sets
+from gpvo.learning.methods import score
+from gpvo.learning.train import _scored, train_sets
 from gpvo.stats.consistency import rms
 from gpvo.stats.series import moving_sums
 from gpvo.types import Status, TruthLog, VoLog, VoRecord
@@ -317,6 +318,20 @@ def test_a_model_learns_odometrys_errors_from_a_noisy_truth(flights, noise):
         nll[name] = evaluate_run(flights[4], predictor).consistency["learned"].nll_per_dim
     assert nll["noisy"] < nll["as told"] - 0.8
     assert nll["noisy"] < nll["exact"] + (0.1 if noise[0] == 0.0 else 0.7)
+
+
+@pytest.mark.parametrize("noise", [(0.0, 0.0, 0.02), (0.02, 0.002, 0.0)])
+def test_a_table_of_training_counts_the_truths_noise_in(flights, noise):
+    """What odometry's errors show by the exact truth is right beside a noisy one, whose errors are much larger."""
+    for k, run in enumerate(flights):
+        exact, rows = build_run(run), _rows(run, k, *noise)
+        C = np.broadcast_to(np.cov(exact.Y.T), (len(rows), 6, 6))
+        found, told = _scored(rows, np.zeros_like(rows.Y), C), score(rows.told, np.zeros_like(rows.Y), C)
+        assert 0.6 < found["nees_dof"]["joint"] < 1.5
+        assert told["nees_dof"]["joint"] > 3.0
+        assert found["nll_per_dim"] < told["nll_per_dim"] - 1.0
+        plain = np.zeros_like(exact.Y), np.broadcast_to(C[0], (len(exact), 6, 6))
+        assert _scored(exact, *plain) == score(exact.Y, *plain)
 
 
 def test_rows_of_a_noisy_truth_are_stored_whole(flights, tmp_path):
