@@ -118,6 +118,24 @@ def test_errors_of_odometry_are_not_blamed_on_the_truth(flights, what):
     assert false_alarms <= 2  # of 60 axes
 
 
+@pytest.mark.parametrize("shake", [0.01, 0.03])
+def test_shaking_that_odometry_smooths_away_is_no_noise_of_the_truth(flights, shake):
+    """Poses swing within four frames; odometry averages three motions, and so lacks part of it."""
+    for seed, run in enumerate(flights):
+        rng, window = np.random.default_rng(seed), np.hanning(9) / np.linalg.norm(np.hanning(9))
+        white = rng.standard_normal((len(run.truth.t_ns), 6)) * np.repeat([shake, 0.1 * shake], 3)
+        swing = np.stack([np.convolve(axis, window, "same") for axis in white.T], axis=1)
+        truth = TruthLog(run.truth.t_ns, run.truth.T_world_cam @ se3.exp(swing))
+        T = interpolate_truth(truth, run.log.t_ns)[0]
+        motions = se3.log(se3.inverse(T[:-1]) @ T[1:])
+        smooth = np.stack([np.convolve(axis, [0.25, 0.5, 0.25], "same") for axis in motions.T], axis=1)
+        smooth += rng.standard_normal(smooth.shape) * np.repeat([2e-3, 3e-4], 3)
+        first, *others = run.log
+        records = [first, *(replace(r, T_prev_cur=t) for r, t in zip(others, se3.exp(smooth), strict=True))]
+        log = VoLog(records, run.log.camera)
+        assert not estimate_truth_noise(motion_errors(log, truth), log)
+
+
 def test_the_truth_tells_over_a_distance(flights):
     run = flights[4]
     T_true, known = interpolate_truth(run.truth, run.log.t_ns)
