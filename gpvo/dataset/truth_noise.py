@@ -60,9 +60,8 @@ class TruthNoise:
 
 def of_errors(errors: MotionErrors, log: VoLog, of_poses: Array) -> Array:
     """(M, 6, 6) covariance that the noise ``of_poses`` (N, 6, 6) at the frames adds to the errors of motions:
-    ``S_end + Ad(T)^-1 S_start Ad(T)^-T``. Where the log does not hold the start, its noise is that of the end."""
-    start = log.parent[errors.index]
-    return compound(errors.T_true, of_poses[np.where(start < 0, errors.index, start)], of_poses[errors.index])
+    ``S_end + Ad(T)^-1 S_start Ad(T)^-T``."""
+    return compound(errors.T_true, of_poses[log.parent[errors.index]], of_poses[errors.index])
 
 
 def of_stamps(

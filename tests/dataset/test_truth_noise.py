@@ -17,6 +17,7 @@ from gpvo.dataset.truth_noise import (
     TruthNoise,
     estimate_truth_noise,
     made_from_odometry,
+    of_errors,
     rates_of,
     telling_distance_m,
 )
@@ -224,6 +225,37 @@ def test_a_jittering_stamp_moves_a_pose_along_its_way():
         scale = np.outer(sigma, sigma)
         np.testing.assert_allclose(off.T @ off / len(off) / scale, C / scale, atol=0.05)
         assert noise.usual(rate[None]) == pytest.approx(sigma)
+
+
+def test_the_error_of_a_motion_holds_the_noise_of_the_poses_at_its_ends(flights):
+    run = flights[0]
+    errors = motion_errors(run.log, run.truth)
+    of_poses = np.random.default_rng(0).uniform(1.0, 9.0, len(run.log))[:, None, None] * np.eye(6)
+    carry = se3.adjoint(se3.inverse(errors.T_true))
+    begins = np.searchsorted(run.log.t_ns, run.log.column("t_prev_ns"))[errors.index]
+    expected = of_poses[errors.index] + carry @ of_poses[begins] @ np.swapaxes(carry, 1, 2)
+    np.testing.assert_allclose(of_errors(errors, run.log, of_poses), expected, rtol=1e-12, atol=1e-12)
+
+
+def test_errors_are_drawn_by_the_size_that_geometry_gives_them():
+    """Seeing is bad for a second in every two; the truth's noise lies between the errors of both."""
+    rng, n = np.random.default_rng(0), 2000
+    sigma = np.where(np.arange(n) % 20 < 10, 1e-3, 2e-2)
+    xi = sigma[:, None] * rng.standard_normal((n, 6))
+    records, T = [VoRecord(0, 0, Status.START, np.eye(4))], [np.eye(4)]
+    for k in range(n):
+        moved = se3.exp(np.array([0.0, 0.0, 0.1, 0.0, 0.0, 0.0]))
+        T.append(T[-1] @ moved)
+        stated = {"triangulation": sigma[k] ** 2 * np.eye(6)}
+        times = (k + 1) * 10**8, k * 10**8
+        records.append(VoRecord(*times, Status.OK, moved @ se3.exp(xi[k]), covariances=stated))
+    noise = TruthNoise(np.full(6, 5e-3))
+    told = TruthLog(np.arange(n + 1) * 10**8, np.array(T) @ se3.exp(5e-3 * rng.standard_normal((n + 1, 6))))
+    log = VoLog(records)
+    drawn, raw = (motion_errors(log, truth).xi for truth in (drawn_without_noise(log, told, noise), told))
+    assert rms(drawn[sigma == 2e-2]) == pytest.approx(2e-2, rel=0.1)
+    assert rms(drawn[sigma == 1e-3]) == pytest.approx(1.2e-3, rel=0.25)
+    assert rms(raw[sigma == 1e-3]).min() > 5e-3
 
 
 def test_rates_are_those_of_an_even_motion_also_at_gaps():
