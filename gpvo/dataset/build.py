@@ -152,8 +152,7 @@ def build(
         (Y, known), told = position_targets(log, seen.usable, truth), None
     else:
         drawn, noise = (truth, noise) if exact else without_noise(log, truth)
-        (Y, known), (told, has) = (motion_targets(records, t) for t in (drawn, truth))
-        known &= has
+        (Y, known), (told, _) = (motion_targets(records, t) for t in (drawn, truth))
     with_truth = int(known.sum())
     if waits == "drop":
         known &= ~in_waits(seen, false_motions(log, truth))

@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 from evaluation_runs import START_NS, make_run
 from gpvo.dataset.build import build
-from gpvo.dataset.errors import interpolate_truth, turn_without_truth_deg
+from gpvo.dataset.errors import interpolate_truth, interpolation_sigma, turn_without_truth_deg
 from gpvo.dataset.misread import FixedRotation
 from gpvo.errors import GpvoError, SourceError
 from gpvo.evaluation.consistency import BY_MODEL
@@ -254,6 +254,10 @@ def test_a_truth_slower_than_the_frames_does_not_make_a_covariance_overconfident
     assert plain is not None
     assert joint is not None
     assert joint < min(plain.mean, 1.2)
+    assert found.run.truth is not None
+    missed = interpolation_sigma(found.run.truth, found.run.log.t_ns)
+    assert (found.truth_sigma >= missed * (1 - 1e-9)).all()
+    assert missed.all()
     told = "The ground truth comes every 0.2 s, the frames every 0.05 s"
     assert any(line.startswith(told) for line in verdict(found).lines)
     assert not of_truth(lambda truth: truth).truth_sigma.any()
