@@ -11,6 +11,7 @@ import numpy as np
 from gpvo.dataset.build import predictions_of
 from gpvo.dataset.doubtful import without_wandering_truth
 from gpvo.dataset.errors import interpolate_truth, motion_errors, require_attitude
+from gpvo.dataset.noiseless import without_noise
 from gpvo.errors import GpvoError
 from gpvo.filters.propagation import DEFAULT_IMU_NOISE
 from gpvo.filters.run import Flight
@@ -83,13 +84,15 @@ def start_sigmas(runs: Sequence[Run]) -> StartSigmas:
 
 
 def constants_of(runs: Sequence[Run]) -> Constants:
-    """Per-axis mean squares of the motions' errors over training runs, each run with equal weight."""
+    """Per-axis mean squares of the motions' errors over training runs, each run with equal weight, without the noise of
+    their truth."""
     squares, dt = [], []
     for run in runs:
         if run.truth is None:
             raise GpvoError("has no ground truth to train a constant on", where=run.path)
         require_attitude(run.log, run.truth, run.path)
-        errors = motion_errors(without_wandering_truth(run.log, run.truth), run.truth)
+        truth = run.truth if run.meta.get("twin") else without_noise(run.log, run.truth)[0]
+        errors = motion_errors(without_wandering_truth(run.log, run.truth), truth)
         if not len(errors.index):
             raise GpvoError("has no motion with ground truth at both ends", where=run.path)
         squares.append((errors.xi**2).mean(axis=0))

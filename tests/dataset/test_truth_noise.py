@@ -24,6 +24,7 @@ from gpvo.dataset.truth_noise import (
 from gpvo.errors import SourceError
 from gpvo.evaluation import panels
 from gpvo.evaluation.evaluate import evaluate_run
+from gpvo.evaluation.flights import constants_of
 from gpvo.evaluation.verdict import verdict
 from gpvo.geometry import se3
 from gpvo.io.run import write_run
@@ -426,3 +427,11 @@ def test_pictures_show_errors_beside_what_is_stated_of_both(flights):
     for axis, one in enumerate(panels.errors(e)):
         (band,) = one["bands"]
         assert np.mean(np.subtract(band["high"], band["low"])) > 2 * 3e3 * np.sqrt(2.0) * e.truth_sigma[axis]
+
+
+def test_constants_of_filters_are_those_of_odometry(flights):
+    told = [replace(run, truth=noisy(run.truth, k, 0.0, 0.0, 0.02)) for k, run in enumerate(flights)]
+    exact, found = (constants_of(runs).mean_squares for runs in (flights, told))
+    raw = np.mean([rms(motion_errors(run.log, run.truth).xi) ** 2 for run in told], axis=0)
+    assert (raw / exact).max() > 10.0
+    assert np.abs(np.log(found / exact)).max() < np.log(1.6)
