@@ -126,9 +126,9 @@ class ScenarioFlights:
 
 
 def fly(name: str, folder: Path, train: int, test: int, *, test_seed: int = FIRST_TEST_SEED, jobs: int = 1,
-        duration_s: float | None = None, keep_tracks: bool = False) -> ScenarioFlights:  # fmt: skip
-    """Simulate as points, run VO; training seeds begin at 1000, test seeds at ``test_seed``."""
-    campaign = Campaign(name, folder, duration_s or DURATIONS_S[name])
+        duration_s: float | None = None, pictures: bool = False, keep_tracks: bool = False) -> ScenarioFlights:  # fmt: skip
+    """Simulate, as points or with pictures, run VO; training seeds begin at 1000, test seeds at ``test_seed``."""
+    campaign = Campaign(name, folder, duration_s or DURATIONS_S[name], pictures)
     seen = training_runs(campaign, train, jobs)
     unseen = flights(replace(campaign, keep_tracks=keep_tracks), range(test_seed, test_seed + test), jobs)
     return ScenarioFlights(name, [build_run(r) for r in seen], unseen)
@@ -181,6 +181,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
     parser.add_argument("--duration", type=float, help="of a flight [s]; default: far enough for 100 m")
     parser.add_argument("--together", action="store_true", help="also one model of all scenarios of equal rate")
     parser.add_argument("--twins", type=int, default=0, help="also a model of so many twins of each test flight")
+    parser.add_argument("--pictures", action="store_true", help="flights with pictures; default: as points")
     given = parser.parse_args(arguments)
     if unknown := [s for s in given.scenarios if s not in DURATIONS_S]:
         raise GpvoError(f"cannot judge {unknown}", cure=f"one of {', '.join(DURATIONS_S)}")
@@ -190,7 +191,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
     for name in given.scenarios:
         flown.append(
             fly(name, given.out, given.train, given.test, test_seed=given.test_seed, jobs=given.jobs,
-                duration_s=given.duration, keep_tracks=given.twins > 0)
+                duration_s=given.duration, pictures=given.pictures, keep_tracks=given.twins > 0)
         )  # fmt: skip
         results[name] = judge(flown[-1], given.jobs)
         if given.twins:
