@@ -126,7 +126,8 @@ class ScenarioFlights:
 
 
 def fly(name: str, folder: Path, train: int, test: int, *, test_seed: int = FIRST_TEST_SEED, jobs: int = 1,
-        duration_s: float | None = None, pictures: bool = False, keep_tracks: bool = False) -> ScenarioFlights:  # fmt: skip
+        duration_s: float | None = None, pictures: bool = False,
+        keep_tracks: bool = False) -> ScenarioFlights:  # fmt: skip
     """Simulate, as points or with pictures, run VO; training seeds begin at 1000, test seeds at ``test_seed``."""
     campaign = Campaign(name, folder, duration_s or DURATIONS_S[name], pictures)
     seen = training_runs(campaign, train, jobs)
