@@ -188,6 +188,9 @@ def whitened(motion: Motion, camera: StereoCamera) -> Whitened:
 
 # Iterations in which the inliers may change; then they stand, or a point on the fence would keep the estimate moving.
 _CHOOSING = 6
+# Of the motion's standard deviation: a last step so small has come to rest. With few points, each step leaves most of
+# what the one before had left; where two motions explain them, the estimate may leave one for the other after 20 steps.
+_AT_REST = 0.01
 # In the first of them, points that tell the translation choose alone: far ones agree with any, and would make good near
 # ones look like outliers.
 _NEAR_FIRST, _ENOUGH = 2, 8
@@ -250,6 +253,8 @@ def refine(
         if np.abs(step).max() < 1e-9 or (iteration > _CHOOSING and np.abs(step).max() < 1e-6):
             converged = True
             break
+    else:
+        converged = bool(step @ information @ step < (_AT_REST * scale) ** 2)
     return Motion(T, keep, scale, r[:, keep].T, smoothed[keep], information, converged, noise)
 
 

@@ -64,6 +64,32 @@ def test_outliers_are_left_out() -> None:
     assert motion.scale_px == pytest.approx(0.2, rel=0.25)
 
 
+def test_an_estimate_at_rest_has_converged() -> None:
+    """80 motions of 20 points far ahead, close together, whose disparity is off by half a pixel in both frames alike.
+
+    Each step then leaves most of what the one before had left. That is no doubt about the motion where it is a
+    hundredth of its standard deviation; 200 steps end at the same place.
+    """
+    camera, noise = StereoCamera(720.0, 720.0, 610.0, 175.0, 0.54, 1242, 375), PointNoise(persistent=30.0)
+    start, slow = se3.exp(np.array([0.0, 0, 1, 0, 0, 0])), 0
+    for seed in range(80):
+        rng = np.random.default_rng(seed)
+        before = np.stack([rng.uniform(a, b, 20) for a, b in ((535, 685), (100, 250), (1 / 8, 1 / 3))], axis=1)
+        before[:, 2] = 1 / before[:, 2]
+        T = start @ se3.exp(rng.normal(0, (0.05, 0.05, 0.05, 0.01, 0.01, 0.01)))
+        pair = noisy(rng, before, 0.1), noisy(rng, transfer(T, before, camera).uvd.T, 0.1)
+        motion, last = (
+            refine(start, *pair, camera, noise=noise, tolerance_px=4.0, max_iterations=n) for n in (12, 200)
+        )
+        if motion is None or last is None:  # the noise may leave a motion undetermined
+            continue
+        off = se3.log(se3.inverse(motion.T_prev_cur) @ last.T_prev_cur)
+        assert motion.converged
+        assert off @ motion.information @ off < (0.05 * motion.scale_px) ** 2
+        slow += np.abs(off).max() > 1e-6
+    assert slow > 2  # by a rule of a micrometre these had not converged
+
+
 def test_undetermined_motion_is_none() -> None:
     uvd = np.tile([[320.0, 240.0, 10.0]], (10, 1))
     assert refine(np.eye(4), uvd[:2], uvd[:2], CAMERA) is None
