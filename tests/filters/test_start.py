@@ -69,6 +69,11 @@ def test_static_start_refuses_a_moving_vehicle() -> None:
     imu = _rest(np.random.default_rng(1), np.eye(3), np.zeros(3))
     with pytest.raises(GpvoError, match=r"not at rest.*turn rate"):
         from_rest(replace(imu, gyro_radps=imu.gyro_radps + 0.5), 0)
+    # Falling, or launched straight up, an IMU is as quiet as at rest; only the size of the force tells.
+    for force_mps2 in (0.0, 9.0, 29.0):
+        falling = replace(imu, acc_mps2=imu.acc_mps2 * force_mps2 / 9.80665)
+        with pytest.raises(GpvoError, match=r"not at rest.*off gravity"):
+            from_rest(falling, 0)
     with pytest.raises(GpvoError, match="10 IMU samples"):
         from_rest(imu, 10**12)
 
