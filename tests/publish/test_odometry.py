@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 from gpvo.errors import GpvoError
 from gpvo.geometry import se3
+from gpvo.geometry.covariance import lost_covariance
 from gpvo.geometry.se3 import R_FLU_OPTICAL
 from gpvo.publish.odometry import LEAST_VARIANCE, OdometryBuilder, lift, messages
 from gpvo.types import IMPORTED_POSE, Prediction, Status, VoRecord
@@ -101,6 +102,31 @@ def test_before_any_motion_a_lost_frame_fits_vehicles_of_any_speed(speed_mps: fl
     out = OdometryBuilder(floor=TINY).step(VoRecord(10**8, 0, Status.LOST, np.eye(4)))
     moved = se3.exp(np.array([0, 0, 0.1 * speed_mps, 0, 0, 0]))[:3, 3]
     assert moved @ np.linalg.solve(out.pose_covariance[:3, :3], moved) < 9.0
+
+
+def test_without_a_covariance_a_lost_frame_is_as_unsure_as_the_vehicle_was_fast() -> None:
+    C, builder = 1e-8 * np.eye(6), OdometryBuilder(floor=TINY)
+    builder.step(
+        VoRecord(10**8, 0, Status.OK, se3.exp(np.array([0, 0, 3.0, 0, 0, 0]))), _prediction(10**8, 0 * C, C, C)
+    )
+    lost = VoRecord(2 * 10**8, 10**8, Status.LOST, np.eye(4), is_reference=False)
+    before, now = (builder.step(replace(lost, t_ns=t)) for t in (2 * 10**8, 3 * 10**8))
+    of_guess = lost_covariance(0.2, np.array([0, 0, 30.0, 0, 0, 0]))
+    assert np.diagonal(now.pose_covariance).max() == pytest.approx(np.diagonal(of_guess).max(), rel=0.01)
+    assert np.trace(before.pose_covariance) < 0.3 * np.trace(now.pose_covariance)
+
+
+@pytest.mark.parametrize("resets, sent", [(254, 255), (255, 0)])
+def test_where_a_source_starts_again_the_twist_is_that_of_its_own_motion(resets: int, sent: int) -> None:
+    C, step, builder = 1e-6 * np.eye(6), se3.exp(np.array([0, 0, 0.1, 0, 0, 0])), OdometryBuilder(resets=resets)
+    first = builder.step(VoRecord(0, 0, Status.START, np.eye(4)))
+    assert first.tracked
+    assert first.twist_body is None
+    builder.step(VoRecord(10**8, 0, Status.OK, step), _prediction(10**8, 0 * C, C, 0 * C))
+    t = 20 * 10**8  # of a reference that nobody has seen
+    out = builder.step(VoRecord(t + 10**8, t, Status.DEGRADED, step), _prediction(t + 10**8, 0 * C, C, 0 * C))
+    np.testing.assert_allclose(out.twist_body, [1, 0, 0, 0, 0, 0], atol=1e-9)
+    assert (out.reset_counter, out.status) == (sent, Status.DEGRADED)
 
 
 def test_after_a_break_the_twist_is_that_of_the_motion_alone() -> None:
@@ -269,6 +295,7 @@ def test_floors_lift_variances_and_keep_it_positive_definite() -> None:
     assert (np.diagonal(out) >= [1e-6] * 3 + [1e-4] * 3).all()
     np.linalg.cholesky(out)
     np.testing.assert_allclose(lift(np.eye(6), 1e-6), np.eye(6))
+    np.testing.assert_array_equal(lift(np.zeros((6, 6)), 1e-9), 1e-9 * np.eye(6))
 
 
 def test_floors_hide_no_prediction_of_a_slow_or_tiny_rig() -> None:
