@@ -157,8 +157,8 @@ def test_fusioncore_floors_a_pose_and_replaces_what_holds_a_zero(odometry: list[
 
 
 def test_fusioncore_loses_what_lies_in_correlations(odometry: list[Odometry]) -> None:
-    # Of those that fusion_node.cpp's encoder_callback reads, vx, vy and the yaw rate, there is a combination whose sigma
-    # is the root of 1 - correlation: less than half of what is taken for it from 0.75 on.
+    # Of vx, vy and the yaw rate, which encoder_callback of fusion_node.cpp reads, there is a combination whose sigma is
+    # the root of 1 - correlation: less than half of what is taken for it from 0.75 on.
     for correlation, hidden in ((0.0, 0.0), (0.74, 0.0), (0.76, 100.0)):
         R = np.eye(6)
         R[0, 5] = R[5, 0] = correlation

@@ -181,6 +181,35 @@ def test_a_restart_of_the_source_is_one_reset() -> None:
     assert builder.step(replace(unknown, is_reference=True)).reset_counter == 1
 
 
+def test_a_record_that_is_sent_twice_or_is_no_number_moves_nothing() -> None:
+    flight = synthetic_flight(0, duration_s=2)
+    plain = list(messages(flight.records, flight.predictions, OdometryBuilder()))
+    bad = replace(flight.records[20], T_prev_cur=np.full((4, 4), np.nan), is_reference=False)
+    for extra in (flight.records[19:20] * 3, [bad]):
+        records = [*flight.records[:20], *extra, *flight.records[20:]]
+        out = list(messages(records, flight.predictions, OdometryBuilder()))
+        assert all(o.twist_body is None for o in out[20 : 20 + len(extra)])
+        for o in out:
+            np.linalg.cholesky(o.pose_covariance)
+        np.testing.assert_array_equal(out[-1].T_odom_body, plain[-1].T_odom_body)
+        np.testing.assert_array_equal(out[-1].pose_covariance, plain[-1].pose_covariance)
+        assert out[-1].reset_counter == 0
+
+
+@pytest.mark.parametrize("missed", [1, 4])
+def test_records_that_were_missed_are_part_of_what_is_unknown(missed: int) -> None:
+    wide = []
+    for seed in range(4):
+        flight = synthetic_flight(seed, duration_s=2)
+        plain = list(messages(flight.records, flight.predictions, OdometryBuilder()))
+        few = [*flight.records[:20], *flight.records[20 + missed :]]
+        out = list(messages(few, flight.predictions, OdometryBuilder()))
+        assert (plain[-1].reset_counter, out[-1].reset_counter) == (0, 1)
+        off = se3.log(se3.inverse(plain[-1].T_odom_body) @ out[-1].T_odom_body)
+        wide.append(np.abs(off[:3]).max() / np.sqrt(np.diagonal(out[-1].pose_covariance)[:3].max()))
+    assert 0.2 < max(wide) < 2.0
+
+
 def test_the_twist_of_a_large_turn_is_as_wrong_as_it_says() -> None:
     rng, T = np.random.default_rng(5), se3.exp(np.array([0.5, 0.1, 1.0, 0.3, 0.8, -0.2]))
     C, squares = np.diag([1e-4, 1e-4, 25e-4, 1e-6, 25e-6, 1e-6]), []
