@@ -10,7 +10,7 @@ import pytest
 from gpvo.errors import GpvoError
 from gpvo.evaluation.flights import start_sigmas
 from gpvo.filters.policies import GeometricPolicy, LearnedPolicy
-from gpvo.filters.propagation import BA, BG, TH
+from gpvo.filters.propagation import BA, BG, TH, V
 from gpvo.filters.run import Flight, FuseOptions, begin, fuse_flight
 from gpvo.filters.start import StartSigmas, from_rest, from_truth, vertical_in_world
 from gpvo.geometry import se3
@@ -47,6 +47,18 @@ def test_static_start_knows_its_tilt_and_bias_together() -> None:
     assert 2.0 < np.mean(nees) < 6.5
     # Three axes, each seen: the mean of 900 squares scatters by sqrt(2 / 900), 5 %; four of that.
     assert 0.8 < np.mean(of_gyro) / 3 < 1.2
+
+
+def test_a_static_start_is_as_unsure_of_its_heading_as_asked() -> None:
+    rng = np.random.default_rng(3)
+    R = se3.so3_exp(np.array([0.4, -0.7, 1.0]))
+    start = from_rest(_rest(rng, R, np.zeros(3)), 0, StartSigmas(yaw_rad=0.3))
+    up = R[2]
+    assert up @ start.covariance[TH, TH] @ up == pytest.approx(0.3**2, rel=0.01)
+    across = np.cross(up, [1.0, 0, 0]) / np.linalg.norm(np.cross(up, [1.0, 0, 0]))
+    tilt_rad = StartSigmas().acc_bias_mps2 / 9.80665
+    assert across @ start.covariance[TH, TH] @ across == pytest.approx(tilt_rad**2, rel=0.05)
+    np.testing.assert_allclose(np.sqrt(np.diagonal(start.covariance[V, V])), 0.01)
 
 
 def test_a_static_start_in_a_world_whose_z_is_not_up() -> None:
