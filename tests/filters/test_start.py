@@ -49,16 +49,18 @@ def test_static_start_knows_its_tilt_and_bias_together() -> None:
     assert 0.8 < np.mean(of_gyro) / 3 < 1.2
 
 
-def test_a_static_start_is_as_unsure_of_its_heading_as_asked() -> None:
-    rng = np.random.default_rng(3)
-    R = se3.so3_exp(np.array([0.4, -0.7, 1.0]))
-    start = from_rest(_rest(rng, R, np.zeros(3)), 0, StartSigmas(yaw_rad=0.3))
-    up = R[2]
-    assert up @ start.covariance[TH, TH] @ up == pytest.approx(0.3**2, rel=0.01)
+def test_a_start_is_as_unsure_of_heading_and_vertical_as_asked() -> None:
+    R, sigmas = se3.so3_exp(np.array([0.4, -0.7, 1.0])), StartSigmas(yaw_rad=0.3, tilt_rad=0.02)
+    still = from_rest(_rest(np.random.default_rng(3), R, np.zeros(3)), 0, sigmas)
+    poses = np.tile(se3.from_rt(R, np.zeros(3)), (5, 1, 1))
+    told = from_truth(50_000_000 * np.arange(5), poses, sigmas)
+    up = R[2]  # in the axes of the body, as the error of the attitude is
     across = np.cross(up, [1.0, 0, 0]) / np.linalg.norm(np.cross(up, [1.0, 0, 0]))
-    tilt_rad = StartSigmas().acc_bias_mps2 / 9.80665
-    assert across @ start.covariance[TH, TH] @ across == pytest.approx(tilt_rad**2, rel=0.05)
-    np.testing.assert_allclose(np.sqrt(np.diagonal(start.covariance[V, V])), 0.01)
+    for start, tilt_rad in ((still, sigmas.acc_bias_mps2 / 9.80665), (told, 0.02)):
+        C = start.covariance[TH, TH]
+        assert up @ C @ up == pytest.approx(0.3**2, rel=0.01)
+        assert across @ C @ across == pytest.approx(tilt_rad**2, rel=0.05)
+    np.testing.assert_allclose(np.sqrt(np.diagonal(still.covariance[V, V])), 0.01)
 
 
 def test_a_static_start_in_a_world_whose_z_is_not_up() -> None:
