@@ -66,6 +66,13 @@ def test_a_wrong_imu_is_named(flight: Flight, change: Callable[[ImuLog], ImuLog]
     assert "\n" not in str(error.value)
 
 
+@pytest.mark.parametrize("per_mps2", [1 / 9.80665, 1e3 / 9.80665, 100.0])
+def test_the_cure_of_a_wrong_unit_restores_the_reading(flight: Flight, per_mps2: float) -> None:
+    wrong = _with_imu(flight, lambda i: replace(i, acc_mps2=i.acc_mps2 * per_mps2))
+    (found,) = [f for f in check_flight(wrong) if f.kind == "acc_unit"]
+    assert per_mps2 * float(found.cure.removeprefix("multiply it by ")) == pytest.approx(1.0, rel=1e-5)
+
+
 @pytest.mark.parametrize("axis", [0, 1, 2])
 def test_a_bias_beyond_what_filters_expect_is_measured(flight: Flight, axis: int) -> None:
     bias = np.radians(5.0) * np.eye(3)[axis]
