@@ -47,6 +47,7 @@ def test_a_good_flight_has_no_findings(seed: int) -> None:
         (lambda i: replace(i, gyro_radps=i.gyro_radps[:, [1, 0, 2]]), "gyro_axes", "axes renamed to (y, x, z)"),
         (lambda i: replace(i, gyro_radps=i.gyro_radps * [1, -1, -1]), "gyro_axes", "(x, -y, -z)"),
         (lambda i: replace(i, acc_mps2=i.acc_mps2[:, [2, 1, 0]]), "acc_axes", "accelerometer's axes renamed"),
+        (lambda i: replace(i, acc_mps2=i.acc_mps2[:, [2, 0, 1]]), "acc_axes", "axes renamed to (y, z, x)"),
         (
             lambda i: replace(i, acc_mps2=i.acc_mps2[:, [2, 0, 1]], gyro_radps=i.gyro_radps[:, [2, 0, 1]]),
             "gyro_axes",
