@@ -144,6 +144,8 @@ def test_a_heartbeat_a_second_and_no_gap_in_the_sequence(received: list) -> None
     assert len(beats) in (4, 5)
     numbers = np.array([m.get_seq() for m in received])
     assert set(np.diff(numbers) % 256) == {1}
+    sender = Sender()
+    assert [sender.heartbeat()[4] for _ in range(258)] == [*range(256), 0, 1]
 
 
 @pytest.mark.parametrize(
