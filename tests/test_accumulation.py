@@ -11,6 +11,7 @@ from evaluation_runs import curved_path, stated_covariance
 from gpvo.accumulation import (
     PoseError,
     along,
+    between_ends,
     carry,
     first_jitter,
     from_end,
@@ -109,6 +110,20 @@ def test_what_a_motion_shares_with_others_and_what_not_is_all_of_its_noise(statu
     before = start * np.eye(6) if lost else start
     shared = before @ first_jitter(T, error.jitter) @ np.transpose(before) + ends
     np.testing.assert_allclose(shared + independent_part(error), error.jitter + error.white, rtol=1e-9, atol=1e-18)
+
+
+def test_between_two_ends_remains_the_difference_of_what_persists():
+    """Of ``now u - Ad^-1 before u'``, u and u' correlated by ``exp(-dt / tau)``, whatever the two roots."""
+    rng, T, none = np.random.default_rng(4), se3.exp(np.array([0.3, -0.1, 0.8, 0.2, -0.4, 0.3])), np.zeros((6, 6))
+    before, now = rng.standard_normal((2, 6, 12))
+    tau_s, A = rng.uniform(0.1, 2.0, 12), carry(T)
+    last, error = (
+        MotionError(mean=np.zeros(6), jitter=none, white=none, persistent_root=root, persistent_tau_s=tau_s, dt_s=DT_S)
+        for root in (before, now)
+    )
+    across = now @ np.diag(np.exp(-0.4 / tau_s)) @ before.T @ A.T
+    expected = now @ now.T + A @ before @ before.T @ A.T - across - across.T
+    np.testing.assert_allclose(between_ends(T, last, error, 0.4), expected, rtol=1e-9, atol=1e-12)
 
 
 @pytest.mark.parametrize("parts", [(0, 1, 0), (0.5, 0.3, 0.2)])

@@ -183,12 +183,14 @@ def _accelerometer_unit(imu: ImuLog) -> Iterator[Finding]:
         text = f"the gyroscope's median reading is {turning:.3g} and the accelerometer's {g:.3g}: they are exchanged"
         yield Finding("acc_unit", text, "the order is gyroscope, accelerometer; or give raw specific force")
         return
-    for unit, factor in (("g", 1.0), ("mg", 1e3), ("cm/s^2", 100 * STANDARD_GRAVITY_MPS2)):
-        if 0.7 < g / factor < 1.4 and steady > 0.8:
-            to_si = STANDARD_GRAVITY_MPS2 / factor
-            text = f"the accelerometer's median reading is {g:.4g} where gravity is 9.81 m/s^2: it is in {unit}"
-            yield Finding("acc_unit", text, f"multiply it by {to_si:.6g}")
-            return
+    # The two last are 2 % apart.
+    units = {"g": 1.0, "mg": 1e3, "cm/s^2": 100 * STANDARD_GRAVITY_MPS2}
+    unit, factor = min(units.items(), key=lambda known: abs(g - known[1]) / known[1])
+    if 0.7 < g / factor < 1.4 and steady > 0.8:
+        to_si = STANDARD_GRAVITY_MPS2 / factor
+        text = f"the accelerometer's median reading is {g:.4g} where gravity is 9.81 m/s^2: it is in {unit}"
+        yield Finding("acc_unit", text, f"multiply it by {to_si:.6g}")
+        return
     if ratio < 0.5:
         text = f"the accelerometer's median reading is {g:.3g} m/s^2: gravity has been removed from it"
         yield Finding("acc_unit", text, "give raw specific force, or use --no-imu")

@@ -25,6 +25,7 @@ _MEDIAN_OF_NORM = 1.54  # of three standard normal numbers
 _OVERLAP = 1.5  # the mean of white noise under hats has so many times the variance that it had under separate ones
 _REST_S, _REST_SAMPLES = 0.5, 10  # that the vehicle must be at rest for, and IMU samples within that show it
 _MOST_GYRO_STD_RADPS, _MOST_ACC_STD_MPS2, _MOST_GYRO_MEAN_RADPS = 0.05, 0.5, 0.1  # of an IMU at rest
+_MOST_OFF_GRAVITY_MPS2 = 0.5  # ten sigmas of its bias
 
 
 @dataclass(frozen=True)
@@ -151,10 +152,12 @@ def from_rest(
 
 
 def _require_rest(gyro: Array, acc: Array) -> None:
+    off_gravity = abs(float(np.linalg.norm(acc.mean(axis=0))) - STANDARD_GRAVITY_MPS2)
     limits = (
         ("gyroscope spread", gyro.std(axis=0).max(), _MOST_GYRO_STD_RADPS, "rad/s"),
         ("accelerometer spread", acc.std(axis=0).max(), _MOST_ACC_STD_MPS2, "m/s^2"),
         ("mean turn rate", np.abs(gyro.mean(axis=0)).max(), _MOST_GYRO_MEAN_RADPS, "rad/s"),
+        ("specific force off gravity by", off_gravity, _MOST_OFF_GRAVITY_MPS2, "m/s^2"),
     )
     reasons = ", ".join(f"{what} {value:.2g} {unit}" for what, value, limit, unit in limits if value > limit)
     if reasons:

@@ -143,7 +143,8 @@ class Timeline:
 
     def add_vo(self, record: VoRecord, prediction: Prediction | None = None) -> list[Step]:
         """Take one VO record; returns the steps done, more than one where later records were used again, or where a
-        clock turns out to have been set: then those since."""
+        clock turns out to have been set: then those since. Give it once :meth:`reaches` is true: readings that have not
+        come are guessed, and those that come for the time before it are not used any more."""
         self._suspect(record)
         told = [rival.line._take(record, prediction) for rival in self._rivals]
         steps = self._take(record, prediction)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Iterator, Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 
@@ -103,24 +103,37 @@ class OdometryBuilder:
         self._T_body_cam, self._Ad = T_body_cam, se3.adjoint(T_body_cam)
 
     def step(self, record: VoRecord, prediction: Prediction | None = None) -> Odometry:
-        """The message of one frame.
+        """The message of one frame; one whose motion is not finite is lost, one that is sent twice changes nothing.
 
         Raises GpvoError where neither a prediction nor the chosen geometric method gives a usable covariance.
         """
+        newest = next(reversed(self._chain.values()), None)
+        if newest is not None and record.t_ns == newest.t_ns:  # sent twice: the pose holds its motion already
+            return self._message(record, prediction, newest, None, None)
+        if not np.isfinite(record.T_prev_cur).all():
+            record = replace(record, T_prev_cur=np.eye(4), status=Status.LOST)
         base = self._chain.get(record.t_prev_ns)
         is_break = record.is_reference and _status(record, prediction) is Status.LOST
         if base is None:
             self.resets += bool(self._chain) and not is_break
-            base = next(reversed(self._chain.values()), None) or _Chain(np.eye(4), PoseError(), record.t_prev_ns)
+            base = newest or _Chain(np.eye(4), PoseError(), record.t_prev_ns)
             self._last = None
         if not record.usable or _status(record, prediction) is Status.LOST:
             return self._lost(record, prediction, base, is_break)
+        if base.t_ns < record.t_prev_ns:
+            base = self._over_gap(base, record.t_prev_ns)
         error = self._error(record, prediction)
         chain = base.extended(record, error)
         twist, twist_covariance = self._twist(record, error, chain)
         self._remember(record, chain)
         self._last = (chain, error)
         return self._message(record, prediction, chain, twist, twist_covariance)
+
+    def _over_gap(self, base: _Chain, t_ns: int) -> _Chain:
+        """The chain at a reference whose records were missed: as unsure as what may have happened since."""
+        gap_s = (t_ns - base.t_ns) * 1e-9
+        unseen = MotionError.independent(lost_covariance(gap_s, self._speed), dt_s=gap_s, status=Status.LOST)
+        return _Chain(base.T_first_cam, base.error.after(np.eye(4), unseen), t_ns)
 
     def _error(self, record: VoRecord, prediction: Prediction | None) -> MotionError:
         if prediction is not None:

@@ -1,6 +1,8 @@
 #if defined(__FAST_MATH__) || (defined(__FINITE_MATH_ONLY__) && __FINITE_MATH_ONLY__) || defined(_M_FP_FAST)
 #error "missing inputs are NaN, which -ffast-math, -ffinite-math-only and /fp:fast do away with: compile without them"
 #endif
+/* Nor with -fsingle-precision-constant, as firmware may be, or where a double has 32 bits: then this has no size. */
+typedef char gpvo_needs_doubles[sizeof(1.0) == 2 * sizeof(1.0f) ? 1 : -1];
 
 /* What the arithmetic below needs of a motion, and what it gives back. Tangent order: translation x y z [m], rotation
  * x y z [rad], in the rectified left optical frame. Matrices are row-major. */

@@ -144,6 +144,8 @@ def test_a_heartbeat_a_second_and_no_gap_in_the_sequence(received: list) -> None
     assert len(beats) in (4, 5)
     numbers = np.array([m.get_seq() for m in received])
     assert set(np.diff(numbers) % 256) == {1}
+    sender = Sender()
+    assert [sender.heartbeat()[4] for _ in range(258)] == [*range(256), 0, 1]
 
 
 @pytest.mark.parametrize(
@@ -153,6 +155,8 @@ def test_a_heartbeat_a_second_and_no_gap_in_the_sequence(received: list) -> None
         ({"confidence": 0.0, "in_domain": 0.9}, 1),
         ({"confidence": 1.0, "in_domain": 1.0}, 100),
         ({"confidence": 0.7, "in_domain": 0.0}, -1),
+        ({"confidence": 0.7, "in_domain": 0.0099}, -1),
+        ({"confidence": 0.7, "in_domain": 0.0101}, 70),
         ({"confidence": 0.001, "in_domain": 0.001}, -1),
         ({"confidence": None, "in_domain": None}, 0),
         ({"tracked": False}, -1),
@@ -160,6 +164,15 @@ def test_a_heartbeat_a_second_and_no_gap_in_the_sequence(received: list) -> None
 )
 def test_quality(odometry: list[Odometry], change: dict, expected: int) -> None:
     assert quality(replace(odometry[5], **change)) == expected
+
+
+def test_a_speed_without_a_model_is_sent_and_tells_of_resets(odometry: list[Odometry]) -> None:
+    sender, parser = Sender(), common.MAVLink(None)
+    frame = replace(odometry[5], confidence=None, in_domain=None, reset_counter=9)
+    for data in (sender.speed(frame), sender.odometry(frame)):
+        (message,) = parser.parse_buffer(data)
+        assert message.reset_counter == 9
+    assert sender.speed(replace(frame, confidence=0.5, in_domain=0.0)) is None
 
 
 def test_udp(odometry: list[Odometry]) -> None:

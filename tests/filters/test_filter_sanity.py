@@ -47,6 +47,7 @@ def test_a_good_flight_has_no_findings(seed: int) -> None:
         (lambda i: replace(i, gyro_radps=i.gyro_radps[:, [1, 0, 2]]), "gyro_axes", "axes renamed to (y, x, z)"),
         (lambda i: replace(i, gyro_radps=i.gyro_radps * [1, -1, -1]), "gyro_axes", "(x, -y, -z)"),
         (lambda i: replace(i, acc_mps2=i.acc_mps2[:, [2, 1, 0]]), "acc_axes", "accelerometer's axes renamed"),
+        (lambda i: replace(i, acc_mps2=i.acc_mps2[:, [2, 0, 1]]), "acc_axes", "axes renamed to (y, z, x)"),
         (
             lambda i: replace(i, acc_mps2=i.acc_mps2[:, [2, 0, 1]], gyro_radps=i.gyro_radps[:, [2, 0, 1]]),
             "gyro_axes",
@@ -64,6 +65,13 @@ def test_a_wrong_imu_is_named(flight: Flight, change: Callable[[ImuLog], ImuLog]
     with pytest.raises(GpvoError) as error:
         require_sane(wrong)
     assert "\n" not in str(error.value)
+
+
+@pytest.mark.parametrize("per_mps2", [1 / 9.80665, 1e3 / 9.80665, 100.0])
+def test_the_cure_of_a_wrong_unit_restores_the_reading(flight: Flight, per_mps2: float) -> None:
+    wrong = _with_imu(flight, lambda i: replace(i, acc_mps2=i.acc_mps2 * per_mps2))
+    (found,) = [f for f in check_flight(wrong) if f.kind == "acc_unit"]
+    assert per_mps2 * float(found.cure.removeprefix("multiply it by ")) == pytest.approx(1.0, rel=1e-5)
 
 
 @pytest.mark.parametrize("axis", [0, 1, 2])

@@ -8,11 +8,25 @@ import numpy as np
 import pytest
 from gpvo.filters import measurement as me
 from gpvo.filters.policies import LearnedPolicy
-from gpvo.filters.propagation import CORE, TH, Nominal, P, constant_velocity_step, imu_step
+from gpvo.filters.propagation import (
+    BA,
+    BG,
+    CORE,
+    TH,
+    ConstantVelocityNoise,
+    Nominal,
+    P,
+    V,
+    constant_velocity_densities,
+    constant_velocity_step,
+    imu_densities,
+    imu_step,
+    process_noise,
+)
 from gpvo.filters.run import FuseOptions, begin, make_filter
 from gpvo.filters.timeline import Timeline
 from gpvo.geometry import se3
-from gpvo.types import MotionError
+from gpvo.types import ImuNoise, MotionError
 from synthetic_flights import FORWARD_CAMERA, ErrorLaw, synthetic_flight
 
 
@@ -101,6 +115,26 @@ def test_transition_of_the_error_state(with_imu: bool) -> None:
         ends = [_difference(moved(_perturbed(x, s))[0], end) for s in (step, -step)]
         numeric[:, i] = (ends[0] - ends[1]) / 2e-6
     np.testing.assert_allclose(F, numeric, atol=2e-7)
+
+
+@pytest.mark.parametrize("with_imu", [True, False])
+def test_the_noise_of_two_intervals_is_that_of_one_twice_as_long(with_imu: bool) -> None:
+    of_imu = ImuNoise(
+        gyro_density_radps_sqrthz=2.0,
+        acc_density_mps2_sqrthz=3.0,
+        gyro_walk_radps2_sqrthz=5.0,
+        acc_walk_mps3_sqrthz=7.0,
+    )
+    of_motion = ConstantVelocityNoise(acceleration=3.0, angular_acceleration=5.0)
+    density = imu_densities(of_imu) if with_imu else constant_velocity_densities(of_motion)
+    driven = ((V, 3.0), (TH, 2.0), (BA, 7.0), (BG, 5.0)) if with_imu else ((V, 3.0), (BG, 5.0))
+    one, two = (process_noise(density, dt, with_imu) for dt in (0.5, 1.0))
+    for block, root in driven:
+        np.testing.assert_allclose(two[block, block], root**2 * np.eye(3))
+    F = np.eye(CORE)
+    for slow, fast in ((P, V),) if with_imu else ((P, V), (TH, BG)):
+        F[slow, fast] = 0.5 * np.eye(3)
+    np.testing.assert_allclose(two, F @ one @ F.T + one, atol=1e-12)
 
 
 def test_a_considered_bias_counts_but_is_not_estimated() -> None:

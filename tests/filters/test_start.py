@@ -10,7 +10,7 @@ import pytest
 from gpvo.errors import GpvoError
 from gpvo.evaluation.flights import start_sigmas
 from gpvo.filters.policies import GeometricPolicy, LearnedPolicy
-from gpvo.filters.propagation import BA, BG, TH
+from gpvo.filters.propagation import BA, BG, TH, V
 from gpvo.filters.run import Flight, FuseOptions, begin, fuse_flight
 from gpvo.filters.start import StartSigmas, from_rest, from_truth, vertical_in_world
 from gpvo.geometry import se3
@@ -49,6 +49,20 @@ def test_static_start_knows_its_tilt_and_bias_together() -> None:
     assert 0.8 < np.mean(of_gyro) / 3 < 1.2
 
 
+def test_a_start_is_as_unsure_of_heading_and_vertical_as_asked() -> None:
+    R, sigmas = se3.so3_exp(np.array([0.4, -0.7, 1.0])), StartSigmas(yaw_rad=0.3, tilt_rad=0.02)
+    still = from_rest(_rest(np.random.default_rng(3), R, np.zeros(3)), 0, sigmas)
+    poses = np.tile(se3.from_rt(R, np.zeros(3)), (5, 1, 1))
+    told = from_truth(50_000_000 * np.arange(5), poses, sigmas)
+    up = R[2]  # in the axes of the body, as the error of the attitude is
+    across = np.cross(up, [1.0, 0, 0]) / np.linalg.norm(np.cross(up, [1.0, 0, 0]))
+    for start, tilt_rad in ((still, sigmas.acc_bias_mps2 / 9.80665), (told, 0.02)):
+        C = start.covariance[TH, TH]
+        assert up @ C @ up == pytest.approx(0.3**2, rel=0.01)
+        assert across @ C @ across == pytest.approx(tilt_rad**2, rel=0.05)
+    np.testing.assert_allclose(np.sqrt(np.diagonal(still.covariance[V, V])), 0.01)
+
+
 def test_a_static_start_in_a_world_whose_z_is_not_up() -> None:
     rng, t_ns = np.random.default_rng(3), np.arange(40) * 50_000_000
     for turn in ([np.radians(3.0), 0, 0], [np.pi / 2, 0, 0], [np.pi, 0.1, 0.2]):
@@ -69,6 +83,11 @@ def test_static_start_refuses_a_moving_vehicle() -> None:
     imu = _rest(np.random.default_rng(1), np.eye(3), np.zeros(3))
     with pytest.raises(GpvoError, match=r"not at rest.*turn rate"):
         from_rest(replace(imu, gyro_radps=imu.gyro_radps + 0.5), 0)
+    # Falling, or launched straight up, an IMU is as quiet as at rest; only the size of the force tells.
+    for force_mps2 in (0.0, 9.0, 29.0):
+        falling = replace(imu, acc_mps2=imu.acc_mps2 * force_mps2 / 9.80665)
+        with pytest.raises(GpvoError, match=r"not at rest.*off gravity"):
+            from_rest(falling, 0)
     with pytest.raises(GpvoError, match="10 IMU samples"):
         from_rest(imu, 10**12)
 

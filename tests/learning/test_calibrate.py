@@ -7,6 +7,7 @@ import pytest
 from gpvo.geometry.covariance import correlation
 from gpvo.learning.basefit import fit_coefficients
 from gpvo.learning.calibrate import (
+    Scale,
     conformal_quantiles,
     fit_outside_power,
     fit_scale,
@@ -70,6 +71,15 @@ def test_conformal_intervals_cover_new_groups():
         assert sure == [True, True, True, True, False]
         inside.append([(score[10] <= w).mean() for w in widths])
     assert (np.mean(inside, axis=0)[:4] >= np.array([0.5, 0.6827, 0.8, 0.9]) - 0.02).all()
+
+
+def test_a_long_flight_counts_as_one_and_few_flights_show_little():
+    group = np.concatenate([np.zeros(1000, dtype=int), np.repeat(np.arange(1, 20), 10)])
+    score = np.where(group == 0, 10.0, 1.0)
+    widths, _ = conformal_quantiles(score, group)
+    assert widths == [1.0] * 4 + [10.0]  # one of twenty, and the new one unknown
+    # Of two flights that are alike, a third may differ by what is expected of flights: worth two groups beside one.
+    np.testing.assert_allclose(Scale.of_new_group(np.ones((2, 6))).spread, 0.3 * np.sqrt(2 / 3))
 
 
 def test_correlation_of_heavy_tailed_residuals():

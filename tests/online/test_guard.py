@@ -6,6 +6,14 @@ from dataclasses import fields
 
 import numpy as np
 from gpvo.learning.basefit import learn_domain
+from gpvo.online.base import (
+    ACCELERATION_COLUMNS,
+    COASTED,
+    TWIST_COLUMNS,
+    Velocities,
+    feature_noise,
+    motion_noise,
+)
 from gpvo.online.guard import Domain
 from hypothesis import given
 from hypothesis import strategies as st
@@ -43,6 +51,34 @@ def test_what_is_not_finite_is_missing() -> None:
     assert np.isfinite(np.stack([domain.least, domain.most])).all()
     assert domain.may_miss.all()
     assert domain.locate(np.array([[np.inf, 0.0], [9.0, 0.0]])).distance[1] > 3.0
+
+
+def test_noise_and_missing_values_count_as_far_as_they_are() -> None:
+    X = np.random.default_rng(0).standard_normal((5000, 1)) * 20.0
+    domain = learn_domain(X)
+    at = domain.reach[1] + 6.0 * domain.scale
+    for noise in (0.0, 30.0, 3000.0):
+        expected = 6.0 / np.sqrt(1.0 + noise / domain.scale[0] ** 2)
+        assert abs(domain.locate(at[None], np.array([[noise]])).distance[0] - expected) < 1e-9
+    assert domain.locate(np.array([[np.nan]])).distance[0] == 2.0
+
+
+def test_the_noise_of_velocities_and_accelerations_is_that_of_drawn_motions() -> None:
+    rng, sigma, dt_s = np.random.default_rng(1), np.array([0.01, 0.02, 0.03, 1e-3, 2e-3, 4e-3]), 0.05
+    names = (*TWIST_COLUMNS, *ACCELERATION_COLUMNS, "n_inliers")
+    before, now = rng.standard_normal((2, 40_000, 6)) * sigma / dt_s
+    square = np.square((now - before) / dt_s).mean(axis=0).reshape(2, 3).sum(axis=1)
+    drawn = [*np.square(now).mean(axis=0), *square, 0.0]
+    noise = feature_noise(motion_noise(names), sigma[None] ** 2, np.array([dt_s]))[0]
+    np.testing.assert_allclose(noise, drawn, rtol=0.05)
+
+
+def test_a_lost_motion_coasts_as_training_did() -> None:
+    change = 1e-3 * np.arange(1.0, 37.0).reshape(6, 6)
+    velocities, none = Velocities(np.full(6, 4.0), change), np.zeros(6)
+    for motions, expected in zip(COASTED, change, strict=True):
+        C = velocities.lost_covariance(0.1, 0.2, 0.1 * motions, none, none, none)
+        np.testing.assert_allclose(np.diagonal(C), expected * 0.2**2, rtol=1e-9)
 
 
 def test_arrays_round_trip() -> None:

@@ -120,6 +120,28 @@ def test_check_of_the_others(odometry: list[Odometry]) -> None:
         consumers.check(odometry, "betaflight")
 
 
+def test_check_reads_of_each_axis_what_the_consumer_reads(odometry: list[Odometry]) -> None:
+    of_pose, of_twist = np.array([0.3, 0.4, 1.2, 0.02, 0.03, 0.06]), np.array([0.02, 0.03, 0.06, 2.0, 3.0, 6.0])
+    grown = np.linspace(0.5, 1.5, len(odometry))
+    frames = [
+        replace(o, pose_covariance=np.diag(of_pose * g) ** 2, twist_covariance=np.diag(of_twist * g) ** 2)
+        for o, g in zip(odometry, grown, strict=True)
+    ]
+    cube = (0.3**4 + 0.4**4 + 1.2**4) ** (1 / 3), (0.02**4 + 0.03**4 + 0.06**4) ** (1 / 3)
+    middle = {
+        "px4": [0.02, 0.3, 0.06],
+        "ardupilot": [1.3, cube[0], 0.07, cube[1], 0.07, 0.06],
+        "robot_localization": [0.02, 0.02],
+    }
+    for consumer, sigmas in middle.items():
+        found = consumers.check(frames, consumer)
+        assert [v.predicted_sigma[1] for v in found] == pytest.approx(sigmas, rel=0.02)
+    # A velocity's sigma has a usual level, whose low end must not be hidden; of a pose's, which grows, the middle.
+    velocity, _, yaw = consumers.check(frames, "px4")
+    assert "Set EKF2_EVV_NOISE to 0.011" in velocity.advice
+    assert "Set EKF2_EVA_NOISE to 0.06" in yaw.advice
+
+
 def test_fusioncore_floors_a_pose_and_replaces_what_holds_a_zero(odometry: list[Odometry]) -> None:
     """vslam_pose_noise_matrix in fusioncore_core/include/fusioncore/sensors/vslam.hpp."""
     C = np.diag([4.0, 1e-6, 9.0, 1e-8, 0.25, 0.16])
@@ -135,12 +157,12 @@ def test_fusioncore_floors_a_pose_and_replaces_what_holds_a_zero(odometry: list[
 
 
 def test_fusioncore_loses_what_lies_in_correlations(odometry: list[Odometry]) -> None:
-    R = np.eye(6)
-    R[0, 5] = R[5, 0] = 0.9  # of those that fusion_node.cpp's encoder_callback reads: vx, vy, yaw rate
-    flat, slanted = (
-        [replace(o, twist_covariance=C, pose_covariance=np.eye(6)) for o in odometry] for C in (np.eye(6), R)
-    )
-    assert [v.hidden_percent for v in consumers.check(flat, "fusioncore")] == [0.0, 0.0]
-    assert [v.hidden_percent for v in consumers.check(slanted, "fusioncore")] == [100.0, 0.0]
+    # Of vx, vy and the yaw rate, which encoder_callback of fusion_node.cpp reads, there is a combination whose sigma is
+    # the root of 1 - correlation: less than half of what is taken for it from 0.75 on.
+    for correlation, hidden in ((0.0, 0.0), (0.74, 0.0), (0.76, 100.0)):
+        R = np.eye(6)
+        R[0, 5] = R[5, 0] = correlation
+        slanted = [replace(o, twist_covariance=R, pose_covariance=np.eye(6)) for o in odometry]
+        assert [v.hidden_percent for v in consumers.check(slanted, "fusioncore")] == [hidden, 0.0]
     assert "use of the diagonal alone hides it in 100 %" in str(consumers.check(slanted, "fusioncore")[0])
     assert "send no zeros" in str(consumers.check(slanted, "fusioncore")[0])

@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 from gpvo.errors import GpvoError
 from gpvo.geometry import se3
+from gpvo.geometry.covariance import lost_covariance
 from gpvo.geometry.se3 import R_FLU_OPTICAL
 from gpvo.publish.odometry import LEAST_VARIANCE, OdometryBuilder, lift, messages
 from gpvo.types import IMPORTED_POSE, Prediction, Status, VoRecord
@@ -103,6 +104,31 @@ def test_before_any_motion_a_lost_frame_fits_vehicles_of_any_speed(speed_mps: fl
     assert moved @ np.linalg.solve(out.pose_covariance[:3, :3], moved) < 9.0
 
 
+def test_without_a_covariance_a_lost_frame_is_as_unsure_as_the_vehicle_was_fast() -> None:
+    C, builder = 1e-8 * np.eye(6), OdometryBuilder(floor=TINY)
+    builder.step(
+        VoRecord(10**8, 0, Status.OK, se3.exp(np.array([0, 0, 3.0, 0, 0, 0]))), _prediction(10**8, 0 * C, C, C)
+    )
+    lost = VoRecord(2 * 10**8, 10**8, Status.LOST, np.eye(4), is_reference=False)
+    before, now = (builder.step(replace(lost, t_ns=t)) for t in (2 * 10**8, 3 * 10**8))
+    of_guess = lost_covariance(0.2, np.array([0, 0, 30.0, 0, 0, 0]))
+    assert np.diagonal(now.pose_covariance).max() == pytest.approx(np.diagonal(of_guess).max(), rel=0.01)
+    assert np.trace(before.pose_covariance) < 0.3 * np.trace(now.pose_covariance)
+
+
+@pytest.mark.parametrize("resets, sent", [(254, 255), (255, 0)])
+def test_where_a_source_starts_again_the_twist_is_that_of_its_own_motion(resets: int, sent: int) -> None:
+    C, step, builder = 1e-6 * np.eye(6), se3.exp(np.array([0, 0, 0.1, 0, 0, 0])), OdometryBuilder(resets=resets)
+    first = builder.step(VoRecord(0, 0, Status.START, np.eye(4)))
+    assert first.tracked
+    assert first.twist_body is None
+    builder.step(VoRecord(10**8, 0, Status.OK, step), _prediction(10**8, 0 * C, C, 0 * C))
+    t = 20 * 10**8  # of a reference that nobody has seen
+    out = builder.step(VoRecord(t + 10**8, t, Status.DEGRADED, step), _prediction(t + 10**8, 0 * C, C, 0 * C))
+    np.testing.assert_allclose(out.twist_body, [1, 0, 0, 0, 0, 0], atol=1e-9)
+    assert (out.reset_counter, out.status) == (sent, Status.DEGRADED)
+
+
 def test_after_a_break_the_twist_is_that_of_the_motion_alone() -> None:
     C, step = 1e-6 * np.eye(6), se3.exp(np.array([0, 0, 0.1, 0, 0, 0]))
     guess = se3.exp(np.array([0.3, 0, 1.5, 0, 0, 0]))
@@ -153,6 +179,35 @@ def test_a_restart_of_the_source_is_one_reset() -> None:
     # Nothing is known of what led from the last frame to a reference that follows none.
     unknown = VoRecord(10**9, 9 * 10**8, Status.LOST, np.eye(4), covariances={"triangulation": C})
     assert builder.step(replace(unknown, is_reference=True)).reset_counter == 1
+
+
+def test_a_record_that_is_sent_twice_or_is_no_number_moves_nothing() -> None:
+    flight = synthetic_flight(0, duration_s=2)
+    plain = list(messages(flight.records, flight.predictions, OdometryBuilder()))
+    bad = replace(flight.records[20], T_prev_cur=np.full((4, 4), np.nan), is_reference=False)
+    for extra in (flight.records[19:20] * 3, [bad]):
+        records = [*flight.records[:20], *extra, *flight.records[20:]]
+        out = list(messages(records, flight.predictions, OdometryBuilder()))
+        assert all(o.twist_body is None for o in out[20 : 20 + len(extra)])
+        for o in out:
+            np.linalg.cholesky(o.pose_covariance)
+        np.testing.assert_array_equal(out[-1].T_odom_body, plain[-1].T_odom_body)
+        np.testing.assert_array_equal(out[-1].pose_covariance, plain[-1].pose_covariance)
+        assert out[-1].reset_counter == 0
+
+
+@pytest.mark.parametrize("missed", [1, 4])
+def test_records_that_were_missed_are_part_of_what_is_unknown(missed: int) -> None:
+    wide = []
+    for seed in range(4):
+        flight = synthetic_flight(seed, duration_s=2)
+        plain = list(messages(flight.records, flight.predictions, OdometryBuilder()))
+        few = [*flight.records[:20], *flight.records[20 + missed :]]
+        out = list(messages(few, flight.predictions, OdometryBuilder()))
+        assert (plain[-1].reset_counter, out[-1].reset_counter) == (0, 1)
+        off = se3.log(se3.inverse(plain[-1].T_odom_body) @ out[-1].T_odom_body)
+        wide.append(np.abs(off[:3]).max() / np.sqrt(np.diagonal(out[-1].pose_covariance)[:3].max()))
+    assert 0.2 < max(wide) < 2.0
 
 
 def test_the_twist_of_a_large_turn_is_as_wrong_as_it_says() -> None:
@@ -269,6 +324,7 @@ def test_floors_lift_variances_and_keep_it_positive_definite() -> None:
     assert (np.diagonal(out) >= [1e-6] * 3 + [1e-4] * 3).all()
     np.linalg.cholesky(out)
     np.testing.assert_allclose(lift(np.eye(6), 1e-6), np.eye(6))
+    np.testing.assert_array_equal(lift(np.zeros((6, 6)), 1e-9), 1e-9 * np.eye(6))
 
 
 def test_floors_hide_no_prediction_of_a_slow_or_tiny_rig() -> None:

@@ -42,6 +42,21 @@ def test_left_becomes_right_and_up_becomes_down() -> None:
     np.testing.assert_allclose(m.velocity_variance, [10, 20, 30])
 
 
+def test_a_camera_s_frame_is_turned_to_look_ahead_and_resets_are_counted() -> None:
+    store = get_typestore(Stores.ROS2_JAZZY)
+    ros.register_px4(store)
+    optical = replace(FRAME, frame_id="left_optical", child_frame_id="left_optical", reset_counter=7)
+    m = ros.vehicle_odometry(optical, store.types)
+    # x right, y down, z ahead are FRD's y, z and x.
+    np.testing.assert_allclose(m.velocity, [3, 1, 2], atol=1e-6)
+    np.testing.assert_allclose(m.angular_velocity, [6, 4, 5], atol=1e-6)
+    np.testing.assert_allclose(m.velocity_variance, [30, 10, 20], rtol=1e-6)
+    np.testing.assert_allclose(m.position, np.roll(FRAME.T_odom_body[:3, 3], 1), rtol=1e-6)
+    np.testing.assert_allclose(m.position_variance, [3, 1, 2], rtol=1e-6)
+    np.testing.assert_allclose(m.q, [np.sqrt(0.5), np.sqrt(0.5), 0, 0], atol=1e-6)
+    assert m.reset_counter == 7
+
+
 def test_a_lost_frame_is_nan_with_quality_minus_one() -> None:
     store = get_typestore(Stores.ROS2_JAZZY)
     ros.register_px4(store)
