@@ -40,7 +40,7 @@ _CURES = {
     "light": "left and right differ in brightness; give both cameras the same exposure and gain",
     "woven": "every second row is of another moment; let the cameras scan progressively, or drop these rows",
     "held": "points stay in place while the image moves; mask what is fixed to the camera, and clean both lenses",
-    "moved": "the cameras have moved against one another; fasten them, and calibrate again",
+    "moved": "the cameras move against one another, or see other moments; fasten them, and trigger both together",
     "size": "the calibration is of images twice as large; scale it, or use images of full size",
 }
 

@@ -56,7 +56,7 @@ _BLOCK = 20  # motions, longer than most features live
 _EXCESS = 16.0, 2.0  # of scatter to begin with, and the number of blocks that this guess is worth
 _DILUTION = 0.1  # share of it, standard deviation: noise differs by direction, so what persists is known no better
 _STEP, _STEPS = 5, 4  # motions between the times at which the cameras may have moved; how many of these are kept
-_MOVED = 10.0  # log odds of two rigs over one from which the cameras have moved: on six real drives at most 4
+_MOVED = 10.0  # log odds of two rigs over one from which the cameras have moved: on six real drives at most 5
 _NEAR = 6.0  # disparity of the points used, in standard deviations of noise: that of far ones says nothing for sure
 
 
