@@ -322,7 +322,6 @@ FAULTS: dict[str, Callable[[Footage], Footage]] = {
     "interlaced": interlaced,
     "half size": half_size,
     "knocked about x": knocked((0.3, 0.0, 0.0)),
-    "knocked about y": knocked((0.0, 0.3, 0.0)),
     "swapped": _each(swapped),
     "bonnet of 10 %": fixed(0.9),
     "bonnet of 25 %": fixed(0.75),
