@@ -44,7 +44,8 @@ class RightSearch:
 
     Of ``sought`` points ``found`` gave a measurement, ``behind`` lie behind the cameras and ``off_row`` in another row.
     ``row_error_px`` (n,): right row minus left row, of points followed from the previous frame;
-    ``row_motion_px`` (n,): by how much these moved down the left image.
+    ``row_motion_px`` (n,): by how much these moved down the left image. ``shifted``: measurements (m, 3) and row errors
+    (m,) of the points found, where most are, but as many rows too low or too high alike; else None.
     """
 
     sought: int
@@ -53,6 +54,7 @@ class RightSearch:
     off_row: int
     row_error_px: Array
     row_motion_px: Array
+    shifted: tuple[Array, Array] | None = None
 
 
 @dataclass(frozen=True)

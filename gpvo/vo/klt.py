@@ -332,13 +332,17 @@ class KltFrontend:
         # Points at infinity have no measurable depth, which is nobody's fault; nor is what lies beyond the image.
         far = known & ~behind & (disparity < max(least_px, KNOWN_DEPTH_PX))
         seen = np.abs(row_error[:n]) < self._config.klt_window_px
+        alike = both.inside & np.isfinite(row_error) & ~off_row
+        shifted = abs(usual) > self._config.max_row_error_px and alike.sum() > 0.5 * both.inside.sum()
         return RightSearch(
             int((both.inside & ~far).sum()),
             int((both.good & ~off_row & ~far & ~behind).sum()),
             int(behind.sum()),
             int(off_row.sum()),
-            both.row_error[:n][seen],  # as measured: an image that is late would else be taken for a rig that is off
+            # Rows that spread may be those of an image that is late; a turn about the optical axis is the rig's.
+            (both.row_error[:n] - self._rig_error.tilt(uvd[:n]))[seen],
             row_motion[seen],
+            (uvd[alike], both.row_error[alike]) if shifted else None,
         )
 
     def _find_again(self, reference: _View, current: _View) -> Matches:

@@ -110,7 +110,13 @@ class StereoOdometry:
             usual_inliers=self._state.usual_inliers,
             doubts=doubts,
         )
+        moved = self.rig_error.moved
         record = self._record(frame.t_ns, guess, matches, motion, verdict, choice.otherwise)
+        if self.rig_error.moved > moved:
+            self.pair.note("moved", seen=True)
+            reason = "; ".join(filter(None, [record.reason, "the cameras have moved against one another"]))
+            status = Status.DEGRADED if record.status is Status.OK else record.status
+            record = replace(record, status=status, reason=reason)
         clock.lap("covariance")
         is_reference, counts = self._advance(record, matches, motion, tells=choice.tells)
         self._window.advance(is_reference)
@@ -239,6 +245,9 @@ class StereoOdometry:
             moments = ResidualMoments.of(motion.residuals, white.moved.G)
             record = replace(record, **motion_fields(matches, motion, self.camera, moments))
         if motion is None or verdict.status is Status.LOST:
+            right = matches.right
+            if right is not None and right.shifted is not None and not (self.pair.late or self.pair.unsharp):
+                self.rig_error.update_rows(*right.shifted)
             known = None if state.t_twist_ns is None else state.twist
             C = lost_covariance((t_ns - state.t_believed_ns) * 1e-9, known)
             return replace(

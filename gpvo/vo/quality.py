@@ -40,6 +40,7 @@ _CURES = {
     "light": "left and right differ in brightness; give both cameras the same exposure and gain",
     "woven": "every second row is of another moment; let the cameras scan progressively, or drop these rows",
     "held": "points stay in place while the image moves; mask what is fixed to the camera, and clean both lenses",
+    "moved": "the cameras move against one another, or see other moments; fasten them, and trigger both together",
     "size": "the calibration is of images twice as large; scale it, or use images of full size",
 }
 
@@ -195,8 +196,11 @@ class PairWatch:
         self._seen[cause] += seen
 
     def findings(self) -> list[str]:
-        """What was wrong in more than a twentieth of the pairs, with the remedy."""
-        often = [(n, cause) for cause, n in self._seen.items() if n > max(2, _NAMED_FROM * self._frames)]
+        """What was wrong in more than a twentieth of the pairs, or lasts, with the remedy."""
+        least = max(2, _NAMED_FROM * self._frames)
+        no_pairs = any(self._seen[cause] > least for cause in ("late", "size", "swapped", "woven"))
+        once = "" if no_pairs else "moved"
+        often = [(n, cause) for cause, n in self._seen.items() if n > (0 if cause == once else least)]
         return [f"{_CURES[cause]} ({n} of {self._frames} pairs)" for n, cause in sorted(often, reverse=True)]
 
     def _lateness(self, right: RightSearch) -> float:

@@ -25,6 +25,8 @@ that an exact rig keeps its exact geometry, and a camera knocked out of place ke
 
 from __future__ import annotations
 
+from collections import deque
+from collections.abc import Sequence
 from dataclasses import dataclass
 from itertools import product
 
@@ -53,6 +55,8 @@ _NEGLIGIBLE = 1e-12  # probability of a kind
 _BLOCK = 20  # motions, longer than most features live
 _EXCESS = 16.0, 2.0  # of scatter to begin with, and the number of blocks that this guess is worth
 _DILUTION = 0.1  # share of it, standard deviation: noise differs by direction, so what persists is known no better
+_STEP, _STEPS = 5, 4  # motions between the times at which the cameras may have moved; how many of these are kept
+_MOVED = 10.0  # log odds of two rigs over one from which the cameras have moved: on six real drives at most 5
 _NEAR = 6.0  # disparity of the points used, in standard deviations of noise: that of far ones says nothing for sure
 
 
@@ -125,22 +129,25 @@ class RigError:
     camera : the rectified pair as calibrated.
     known : where to start; by default from nothing.
     learn : whether motions change it.
+
+    Where the evidence is that the cameras moved against one another in the last 20 motions, what was learnt before is
+    forgotten (R. Adams, D. MacKay, "Bayesian online changepoint detection", 2007). ``moved``: how often.
     """
 
     def __init__(self, camera: StereoCamera, known: RigState | None = None, *, learn: bool = True) -> None:
-        self._camera = camera
-        self._start = self.state = known or RigState.prior(camera)
+        self._camera, self.moved = camera, 0
+        self.state = known or RigState.prior(camera)
         # What is right beyond doubt stays so.
-        self._learn = learn and bool(self._start.covariance.any())
-        # A state from a file is no calibration to return to.
-        self._may_be_exact = known is None
+        self._learn = learn and bool(self.state.covariance.any())
         if not self._learn:
             return
-        precision = np.asarray(np.linalg.inv(self._start.covariance), np.float64)
+        precision = np.asarray(np.linalg.inv(self.state.covariance), np.float64)
         self._blocks = (_Blocks(precision[_DX, _DX]), _Blocks(precision[_DY, _DY]))
-        kinds = product(_MOUNTINGS, _LENSES, _ROLLS) if self._may_be_exact else ()
-        covariances = [prior_covariance(camera, *kind) for kind in kinds] or [self._start.covariance]
-        self._kinds = _Gaussians.of(self._start.mean, np.stack(covariances))
+        self._motions, self._past = 0, deque[tuple[_Sums, _Sums]](maxlen=_STEPS)
+        covariances = [prior_covariance(camera, *kind) for kind in product(_MOUNTINGS, _LENSES, _ROLLS)]
+        self._any = _Gaussians.of(np.zeros(2 * N_TERMS), np.stack(covariances))
+        # A state from a file is no calibration to return to.
+        self._kinds = self._any if known is None else _Gaussians.of(known.mean, known.covariance[None])
         self._exact = _Gaussians.of(np.zeros(N_TERMS), prior_covariance(camera, roll=0.0)[None, _DY, _DY])
         self.state = self._mixed(np.zeros_like(precision), np.zeros(len(precision)))
 
@@ -217,12 +224,42 @@ class RigError:
         weighted = rows * np.minimum(1.0, 2.5 * sigma / np.maximum(np.abs(off), 1e-9)) / sigma**2
         self._blocks[1].add(weighted @ rows.T, weighted @ row_error)
 
+    def update_rows(self, uvd: Array, row_error: Array) -> None:
+        """Learn from rows (M,) at measurements (M, 3) alone: those of a pair whose rows leave no motion to be found."""
+        if self._learn:
+            self._learn_rows(self._terms(uvd) * self._camera.fy_px, row_error)
+            self._conclude()
+
+    def _look_back(self) -> None:
+        """Forget what came before the cameras moved, if they did."""
+        self._motions += 1
+        if self._motions % _STEP:
+            return
+        now = self._blocks[0].sums, self._blocks[1].sums
+        whole = self._evidence(self._kinds, now)
+        for before in reversed(self._past):
+            since = [n.since(b) for n, b in zip(now, before, strict=True)]
+            if self._evidence(self._kinds, before) + self._evidence(self._any, since) - whole > _MOVED:
+                for block, past in zip(self._blocks, before, strict=True):
+                    block.forget(past)
+                self._kinds, self.moved = self._any, self.moved + 1
+                self._past.clear()
+                return
+        self._past.append(now)
+
+    def _evidence(self, kinds: _Gaussians, sums: Sequence[_Sums]) -> float:
+        """Log probability of what was learnt, up to a term that is the same in sum for its parts."""
+        learnt = [block.believed(s) for s, block in zip(sums, self._blocks, strict=True)]
+        evidence = kinds.given(*_joined(learnt))[2]
+        if len(evidence) == 1:
+            return float(evidence[0])
+        exact = self._exact.given(*(x[None] for x in learnt[1]))[2]
+        return float(np.logaddexp(np.logaddexp.reduce(evidence - np.log(len(evidence))), exact[0]) - np.log(2))
+
     def _conclude(self) -> None:
         """The state given all that was learnt."""
-        information, score = np.zeros((2 * N_TERMS, 2 * N_TERMS)), np.zeros(2 * N_TERMS)
-        for part, block in zip((_DX, _DY), self._blocks, strict=True):
-            information[part, part], score[part] = block.believed()
-        self.state = self._mixed(information, score)
+        self._look_back()
+        self.state = self._mixed(*_joined([block.believed() for block in self._blocks]))
         for part, block in zip((_DX, _DY), self._blocks, strict=True):
             block.close(self.state.mean[part], self.state.covariance[part, part])
 
@@ -251,6 +288,10 @@ class RigError:
         c = self._camera
         return terms((uvd[:, 0] - uvd[:, 2] - c.cx_px) / c.fx_px, (uvd[:, 1] - c.cy_px) / c.fy_px)
 
+    def tilt(self, uvd: Array) -> Array:
+        """(N,) the part of the row errors that a turn about the optical axis makes [px]."""
+        return np.asarray(self._camera.fy_px * self.state.mean[N_TERMS + 1] * self._terms(uvd)[1], np.float64)
+
     def errors(self, uvd: Array) -> tuple[Array, Array]:
         """(N,) errors of disparity and of the row difference [px]."""
         phi, mean = self._terms(uvd), self.state.mean
@@ -259,73 +300,99 @@ class RigError:
 
 @dataclass(frozen=True)
 class _Gaussians:
-    """K beliefs about n coefficients, of one mean: ``precision`` (K, n, n), ``score`` (K, n), precision times mean, and
-    ``log_det`` (K,) of the precision."""
+    """K beliefs about n coefficients, of one mean: ``precision`` (K, n, n), ``score`` (K, n), precision times mean,
+    ``log_det`` (K,) of the precision, and ``at_mean`` (K,), the mean times the score."""
 
     precision: Array
     score: Array
     log_det: Array
+    at_mean: Array
 
     @classmethod
     def of(cls, mean: Array, covariance: Array) -> _Gaussians:
         """Of a mean (n,) and covariances (K, n, n)."""
         precision = np.asarray(np.linalg.inv(covariance), np.float64)
-        return cls(precision, precision @ mean, np.linalg.slogdet(precision)[1])
+        score = precision @ mean
+        return cls(precision, score, np.linalg.slogdet(precision)[1], score @ mean)
 
     def given(self, information: Array, score: Array) -> tuple[Array, Array, Array]:
-        """Precisions (K, n, n), means (K, n) and, where the mean was zero, log evidence (K,) up to a common term, after
-        measurements."""
+        """Precisions (K, n, n), means (K, n) and log evidence (K,), up to a common term, after measurements."""
         precision, total = self.precision + information, self.score + score
         mean = np.asarray(np.linalg.solve(precision, total[..., None])[..., 0], np.float64)
         log_det = self.log_det - np.linalg.slogdet(precision)[1]
-        return precision, mean, 0.5 * ((mean * total).sum(axis=1) + log_det)
+        return precision, mean, 0.5 * ((mean * total).sum(axis=1) - self.at_mean + log_det)
+
+
+def _joined(learnt: Sequence[tuple[Array, Array]]) -> tuple[Array, Array]:
+    """Information (30, 30) and score (30,) of both polynomials from those of each."""
+    information, score = np.zeros((2 * N_TERMS, 2 * N_TERMS)), np.zeros(2 * N_TERMS)
+    (information[_DX, _DX], score[_DX]), (information[_DY, _DY], score[_DY]) = learnt
+    return information, score
+
+
+@dataclass(frozen=True)
+class _Sums:
+    """Information (15, 15) and score (15,) of one polynomial as if frames were independent, and the dilution (15,) of
+    the score."""
+
+    information: Array
+    score: Array
+    dilution: Array
+
+    def since(self, before: _Sums) -> _Sums:
+        """What was added to ``before``."""
+        a, b = self, before
+        return _Sums(a.information - b.information, a.score - b.score, a.dilution - b.dilution)
 
 
 class _Blocks:
-    """Information and score of one polynomial as if frames were independent, and by how much blocks of frames scatter
-    more than that."""
+    """The sums of one polynomial, and by how much blocks of frames scatter more than if frames were independent."""
 
     def __init__(self, precision: Array) -> None:
-        self.information: Array = np.zeros((N_TERMS, N_TERMS))
-        self.score: Array = np.zeros(N_TERMS)
-        self._dilution: Array = np.zeros(N_TERMS)
-        self._freedom = _EXCESS[1] * N_TERMS
-        self._chi2 = _EXCESS[0] * self._freedom
+        self.sums = self._before = _Sums(np.zeros((N_TERMS, N_TERMS)), np.zeros(N_TERMS), np.zeros(N_TERMS))
+        self._count = 0
+        freedom = _EXCESS[1] * N_TERMS
+        self._scatter = self._scatter_earlier = (_EXCESS[0] * freedom, freedom)
         self._floor = 1e-6 * precision
-        self._begin()
 
     @property
     def excess(self) -> float:
         """Variance of a block's score over its information."""
-        return self._chi2 / self._freedom
+        return self._scatter[0] / self._scatter[1]
 
-    def believed(self) -> tuple[Array, Array]:
-        """Information and score, of which the excess and a share of the dilution may be no signal."""
-        if not self._dilution.any():
-            return self.information / self.excess, self.score / self.excess
-        dilution = _DILUTION * self._dilution
-        diluted = np.linalg.solve(self.information + self._floor, dilution)
-        part = dilution / (self.excess + dilution @ diluted)
+    def believed(self, among: _Sums | None = None) -> tuple[Array, Array]:
+        """Information and score, of which the excess and a share of the dilution may be no signal: of all, or ``among``
+        a part, by the excess of a block ago."""
+        sums, (chi2, freedom) = (self.sums, self._scatter) if among is None else (among, self._scatter_earlier)
+        excess = chi2 / freedom
+        if not sums.dilution.any():
+            return sums.information / excess, sums.score / excess
+        dilution = _DILUTION * sums.dilution
+        diluted = np.linalg.solve(sums.information + self._floor, dilution)
+        part = dilution / (excess + dilution @ diluted)
         return (
-            (self.information - np.outer(part, dilution)) / self.excess,
-            (self.score - part * (diluted @ self.score)) / self.excess,
+            (sums.information - np.outer(part, dilution)) / excess,
+            (sums.score - part * (diluted @ sums.score)) / excess,
         )
 
     def add(self, information: Array, score: Array, dilution: Array | float = 0.0) -> None:
         """Take in one motion; the score is that of a state of zero."""
-        self.information, self.score = self.information + information, self.score + score
-        self._dilution = self._dilution + dilution
+        s = self.sums
+        self.sums = _Sums(s.information + information, s.score + score, s.dilution + dilution)
         self._count += 1
 
     def close(self, mean: Array, covariance: Array) -> None:
         """At the end of a block, compare its score at the estimate with what is expected of it."""
         if self._count < _BLOCK:
             return
-        information, score = self.information - self._before[0], self.score - self._before[1]
-        left = score - information @ mean
-        self._freedom += N_TERMS - float((information * covariance).sum()) / self.excess
-        self._chi2 += float(left @ np.linalg.solve(information + self._floor, left))
-        self._begin()
+        block = self.sums.since(self._before)
+        left = block.score - block.information @ mean
+        chi2 = float(left @ np.linalg.solve(block.information + self._floor, left))
+        freedom = N_TERMS - float((block.information * covariance).sum()) / self.excess
+        self._scatter_earlier, self._scatter = self._scatter, (self._scatter[0] + chi2, self._scatter[1] + freedom)
+        self._count, self._before = 0, self.sums
 
-    def _begin(self) -> None:
-        self._count, self._before = 0, (self.information, self.score)
+    def forget(self, before: _Sums) -> None:
+        """Only what was added to ``before`` counts, and blocks that the change lies in tell nothing of their excess."""
+        self.sums = self.sums.since(before)
+        self._count, self._before, self._scatter = 0, self.sums, self._scatter_earlier

@@ -193,6 +193,24 @@ def interlaced(footage: Footage) -> Footage:
     return replace(footage, frames=[f[0], *frames])
 
 
+def knocked(degrees: tuple[float, float, float], first: int = 30) -> Callable[[Footage], Footage]:
+    """From frame ``first`` on, the right camera is turned by so much about x, y and z."""
+
+    def turn(footage: Footage) -> Footage:
+        c = footage.camera
+        H = c.K @ se3.so3_exp(-np.deg2rad(degrees)) @ np.linalg.inv(c.K)
+
+        def one(k: int, f: StereoFrame) -> StereoFrame:
+            if k < first:
+                return f
+            seen = cv2.warpPerspective(f.right, H, (c.width, c.height), flags=cv2.INTER_CUBIC, borderMode=1)
+            return replace(f, right=np.asarray(seen, np.uint8))
+
+        return _each(one)(footage)
+
+    return turn
+
+
 def half_size(footage: Footage) -> Footage:
     """Images of half the size with the calibration of the full one."""
     c = footage.camera
@@ -303,6 +321,7 @@ FAULTS: dict[str, Callable[[Footage], Footage]] = {
     "late right": late_right,
     "interlaced": interlaced,
     "half size": half_size,
+    "knocked about x": knocked((0.3, 0.0, 0.0)),
     "swapped": _each(swapped),
     "bonnet of 10 %": fixed(0.9),
     "bonnet of 25 %": fixed(0.75),

@@ -177,6 +177,30 @@ def test_the_cause_is_named_with_its_cure(footage: stress.Footage) -> None:
     assert odometry.pair.findings() == []
 
 
+@pytest.mark.parametrize("degrees", [(0.3, 0.0, 0.0), (0.0, 0.3, 0.0), (0.0, 0.0, -0.5)])
+def test_a_knock_in_flight_is_forgotten_and_named(degrees: tuple[float, float, float]) -> None:
+    """The right camera turns at frame 30. Motions from frame 44 on were wrong by 3 (x), 8 (y) and 20 % (z), median."""
+    clip = render_clip(pinhole(480, 360), wander(56, speed_mps=1.6, seed=5))
+    changed = stress.knocked(degrees)(stress.Footage(clip.camera, clip.frames, clip.T_world_cam))
+    outcome = stress.run(changed)
+    assert np.median(outcome.error_m[44:] / outcome.moved_m[44:]) < 0.03
+    assert all(r.status is Status.OK for r in outcome.records[44:])
+    assert sum("moved against one another" in r.reason for r in outcome.records) == 1
+    odometry = StereoOdometry(changed.camera)
+    for frame in changed.frames:
+        odometry.step(frame)
+    findings = " ".join(odometry.pair.findings())
+    assert "fasten them" in findings
+    assert "a frame apart" not in findings
+
+
+def test_a_turn_about_the_optical_axis_is_no_delay() -> None:
+    """A right camera that is turned by 0.8 degrees from the start: where both roll, too, its rows looked late."""
+    clip = render_clip(pinhole(480, 360), wander(30, speed_mps=1.6, seed=5))
+    outcome = stress.run(stress.knocked((0.0, 0.0, 0.8), 0)(stress.Footage(clip.camera, clip.frames, clip.T_world_cam)))
+    assert not any("late" in reason for reason in outcome.reasons)
+
+
 def test_noise_looks_like_nothing() -> None:
     """Lucas and Kanade's search succeeds in noise wherever it starts; hardly any patch found there is alike."""
     rng = np.random.default_rng(0)
