@@ -279,8 +279,9 @@ def _of_direction(error: Array, true: Array, noise: Array, count: int) -> list[t
     # Noise along one axis, as depth's, lies partly along another of what is across.
     noise_m = np.sqrt(np.einsum("wij,wj->wi", across**2, _noise_of_sums(noise, count) ** 2))
     allowed = np.maximum(_spread(turn[moving] - usual), noise_m / path)
-    # What a single motion makes of a window is a slip: it says nothing of the others.
-    single = np.lib.stride_tricks.sliding_window_view(np.abs(error), count, axis=0).max(axis=-1) / path
+    # What a single motion makes of a window, on whatever axis lies across it, is a slip: it says nothing of the others.
+    size = np.linalg.norm(error, axis=1)
+    single = np.lib.stride_tricks.sliding_window_view(size, count).max(axis=-1)[:, None] / path
     off = moving & (np.abs(turn - usual) - single > np.maximum(_SIGMAS * allowed, _LEAST_TURN)).any(axis=1)
     found = []
     for first, last in _runs(_covered(off, count)) if off.mean() <= _MOST else []:

@@ -32,7 +32,7 @@ HONEST = (0.5, 2.0)
 _FEW_WINDOWS = 5
 _FEW_BARE = 0.01  # of the frames, without truth: its ends
 _LEAST_PATH_M, _MOST_SCALE = 0.5, 1.5
-_FAR, _FEW_FAR, _OUTWEIGH = 20.0, 0.05, 0.9  # medians; share of the motions; of the sum of all squared errors
+_FAR, _FEW_FAR, _OUTWEIGH = 20.0, 0.05, 0.5  # medians; share of the motions; of the sum of all squared errors
 
 Colour = Literal["green", "amber", "red"]
 
@@ -286,8 +286,10 @@ def _of_frames(turned: FixedRotation, camera: StereoCamera | None) -> str:
 
 
 def _of_size(what: str, scale: float, camera: StereoCamera | None) -> str:
-    own = " Are the baseline and the focal length right?" if camera is not None else ""
-    return f"The odometry's {what} {scale:.3g} times as large as the truth's: are both in metres?{own}"
+    asked = "a wrong baseline or focal length, or a camera alone."
+    if not 1 / _MOST_SCALE < scale < _MOST_SCALE:
+        asked = "are both in metres?" + " Are the baseline and the focal length right?" * (camera is not None)
+    return f"The odometry's {what} {scale:.3g} times as large as the truth's: {asked}"
 
 
 def _of_few_motions(e: Evaluation) -> Iterator[str]:

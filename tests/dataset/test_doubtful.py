@@ -328,6 +328,16 @@ def test_a_slip_is_no_stretch(rate_hz):
     assert odd_stretches(log, replace(truth, T_world_cam=T)) == []
 
 
+@pytest.mark.parametrize("size", [0.3, 5.0])
+def test_a_slip_askew_is_no_odd_stretch_either(size):
+    """A closed loop, or another map: what it makes of a window is partly along other axes than its own."""
+    for seed in range(8):
+        log, truth = white_noise_run(seed, 10, stepped=False)
+        slip = se3.exp(size * np.random.default_rng(seed).standard_normal(6) * [1, 1, 1, 0.2, 0.2, 0.2])
+        records = [replace(r, T_prev_cur=r.T_prev_cur @ slip) if k == 150 else r for k, r in enumerate(log.records)]
+        assert odd_stretches(VoLog(records, None), truth) == []
+
+
 @pytest.mark.filterwarnings("error")
 @pytest.mark.parametrize("rate_hz", [10, 200])
 def test_a_log_at_rest_has_none_and_no_warnings(rate_hz):
