@@ -72,7 +72,8 @@ def _why_blind(e: Evaluation) -> str:
     if made_from_odometry(e.errors, e.run.log):
         return (
             "From one motion to the next, odometry and truth agree as no two measurements do, so nothing can be judged:"
-            " was the truth made from odometry, as by closing loops?"
+            " was the truth made from odometry, as by closing loops, or is odometry propagated between corrections that"
+            " come at a lower rate? Then give it at theirs."
         )
     if len(e.errors.index) < 2 and e.run.log.methods and e.poses is None:
         return "Fewer than two motions have ground truth at both ends, so no covariance can be judged."

@@ -192,6 +192,15 @@ def test_another_unit_is_named(factor: float, told: bool) -> None:
     assert any("1.11 times as large as the truth's: a wrong baseline" in line for line in lines) == (factor == 0.9)
 
 
+def test_odometry_propagated_between_corrections_is_told_from_a_truth_that_was_made_of_it() -> None:
+    log, truth = make_run(600, v_t=False)
+    exact = se3.inverse(truth.T_world_cam[:-1]) @ truth.T_world_cam[1:]
+    some = [r if k % 10 == 0 else replace(r, T_prev_cur=exact[k - 1]) for k, r in enumerate(log)]
+    found = verdict(evaluate_run(Run(Path("imu"), "imu", replace(log, records=some), truth, None, Mounting(), [])))
+    assert not found.judged
+    assert "or is odometry propagated between corrections" in found.headline
+
+
 @pytest.mark.parametrize("factor", [0.9, 1.05, 2.5])
 @pytest.mark.parametrize("lever_m", [0.0, 0.4])
 def test_a_scale_is_not_taken_for_a_lever_arm_nor_hides_one(factor: float, lever_m: float) -> None:
