@@ -14,7 +14,7 @@ from gpvo.cli.describe import as_lines, describe
 from gpvo.cli.output import Json, answer, note, numbers, one_of, progress
 from gpvo.cli.output import time_offset as read_offset
 from gpvo.dataset.clock import estimate_time_offset
-from gpvo.dataset.errors import interpolate_truth
+from gpvo.dataset.errors import held_poses, interpolate_truth
 from gpvo.dataset.hand_eye import FixedTransform, align_frames
 from gpvo.errors import GpvoError, SourceError, counted
 from gpvo.files import plain
@@ -83,10 +83,11 @@ def import_log(
     file, the place and the cure.
     """
     frame = _frame(log) if frame == "auto" else frame
-    place = PLACES[frame]
-    log, given = log.seen_from(place), None
+    held, place = held_poses(log.t_ns, log.trajectory.T_world_body), PLACES[frame]
     if truth is not None:
         check_same_rows(truth, log)
+    log, given = (log.rows(~held) if held.any() else log).seen_from(place), None
+    if truth is not None:
         sigma = truth_sigma or (0.0, 0.0)
         given = TruthLog(truth.t_ns, truth.seen_from(place).trajectory.T_world_body, *sigma)
     if time_offset_s is None:
@@ -95,6 +96,11 @@ def import_log(
         time_offset_s = estimate_time_offset(VoLog(to_records(log)[0]), given)
     log = log.shifted(time_offset_s) if time_offset_s else log
     records, notes = to_records(log)
+    if held.any():
+        notes.append(
+            f"left out: {held.sum()} of {len(held)} poses, which only repeat the one before while the vehicle moves, as"
+            " of odometry that stalls, is lost, or comes at a lower rate"
+        )
     notes += _assumed(truth)
     read = truth.topic if truth is not None and truth.path.resolve() == log.path.resolve() else None
     if unread := ", ".join(t for t in log.other_topics if t != read):

@@ -25,7 +25,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from gpvo.dataset.errors import MotionErrors, interpolate_truth, motion_errors
+from gpvo.dataset.errors import MotionErrors, interpolate_truth, motion_errors, without_held
+from gpvo.geometry import se3
 from gpvo.online.slip import flag_slips
 from gpvo.stats.series import moving_sums
 from gpvo.types import Array, ImuMoments, Status, StereoCamera, TruthLog, VoLog, VoRecord
@@ -68,29 +69,40 @@ def wandering_waits(log: VoLog, truth: TruthLog) -> NDArray[np.int64]:
     return np.array(found, dtype=np.int64).reshape(-1, 2)
 
 
-_JUMP_MEDIANS, _BACK_S = 10.0, 1.0
+_JUMP_MEDIANS, _BACK_S, _BETWEEN = 10.0, 1.0, 0.5  # the last: share of the motions between two jumps
 
 
 def jumps(log: VoLog, truth: TruthLog) -> list[Stretch]:
-    """Motions in which the truth moves as the vehicle cannot, though odometry does not, and far more of an error than
-    usual; those less than a second apart as one, with what lies between."""
+    """Motions in which the truth, at its own rate, moves as the vehicle cannot, though odometry does not, and far more
+    of an error than usual; as one, with what lies between, those less than a second apart, or with such errors between
+    them: markers that were confused until the second."""
     errors = motion_errors(log, truth)
     large = errors.far(_JUMP_MEDIANS)
     if not large.any():
         return []
     t_ns, t_prev_ns = log.t_ns, log.column("t_prev_ns")
-    true = [VoRecord(int(t_ns[k]), int(t_prev_ns[k]), Status.OK, T) for k, T in zip(errors.index, errors.T_true)]
-    far = large & ~flag_slips(replace(log, records=true)).usable & flag_slips(log).usable[errors.index]
+    leaps = in_waits(log, _impossible(log, truth))[errors.index]
+    far = large & leaps & flag_slips(log).usable[errors.index]
     found: list[Stretch] = []
     for k, xi in zip(errors.index[far].tolist(), errors.xi[far], strict=True):
         first, span_ns = k, (int(t_prev_ns[k]), int(t_ns[k]))
-        if found and span_ns[0] - found[-1].t_ns[1] < _BACK_S * 1e9:
+        between = large[(errors.index > found[-1].last) & (errors.index < k)] if found else large[:0]
+        if found and (span_ns[0] - found[-1].t_ns[1] < _BACK_S * 1e9 or (len(between) and between.mean() > _BETWEEN)):
             first, span_ns = found[-1].first, (found[-1].t_ns[0], span_ns[1])
             found.pop()
         metres, degrees = np.linalg.norm(xi[:3]), np.rad2deg(np.linalg.norm(xi[3:]))
         what = f"truth jumps, last by {metres:.2g} m and {degrees:.2g} deg; not scored"
         found.append(Stretch(first, k, span_ns, what))
     return found
+
+
+def _impossible(log: VoLog, truth: TruthLog) -> NDArray[np.int64]:
+    """(K, 2) times [ns] between which the truth moves, from one pose to the next, as the log's vehicle cannot."""
+    own = without_held(truth)
+    motions = se3.inverse(own.T_world_cam[:-1]) @ own.T_world_cam[1:]
+    spans = np.stack([own.t_ns[:-1], own.t_ns[1:]], axis=1)
+    records = [VoRecord(end, start, Status.OK, T) for (start, end), T in zip(spans.tolist(), motions, strict=True)]
+    return spans[~flag_slips(replace(log, records=records)).usable]
 
 
 def false_motions(log: VoLog, truth: TruthLog, leaps: Sequence[Stretch] | None = None) -> NDArray[np.int64]:
@@ -267,8 +279,9 @@ def _of_direction(error: Array, true: Array, noise: Array, count: int) -> list[t
     # Noise along one axis, as depth's, lies partly along another of what is across.
     noise_m = np.sqrt(np.einsum("wij,wj->wi", across**2, _noise_of_sums(noise, count) ** 2))
     allowed = np.maximum(_spread(turn[moving] - usual), noise_m / path)
-    # What a single motion makes of a window is a slip: it says nothing of the others.
-    single = np.lib.stride_tricks.sliding_window_view(np.abs(error), count, axis=0).max(axis=-1) / path
+    # What a single motion makes of a window, on whatever axis lies across it, is a slip: it says nothing of the others.
+    size = np.linalg.norm(error, axis=1)
+    single = np.lib.stride_tricks.sliding_window_view(size, count).max(axis=-1)[:, None] / path
     off = moving & (np.abs(turn - usual) - single > np.maximum(_SIGMAS * allowed, _LEAST_TURN)).any(axis=1)
     found = []
     for first, last in _runs(_covered(off, count)) if off.mean() <= _MOST else []:

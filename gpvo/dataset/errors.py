@@ -28,19 +28,19 @@ def sizes(motions: Array) -> Array:
     return np.stack([np.linalg.norm(v, axis=1) for v in (motions[:, :3, 3], se3.so3_log(motions[:, :3, :3]))])
 
 
-def without_held(truth: TruthLog) -> TruthLog:
-    """The truth without poses that repeat the one before, to the last digit, while the vehicle moves: motion capture
-    that stalls, and slow poses logged at a higher rate, hold the last one.
+def held_poses(t_ns: NDArray[np.int64], T: Array) -> NDArray[np.bool_]:
+    """(N,) which poses (N, 4, 4) repeat the one before, to the last digit, while the vehicle moves: motion capture or
+    odometry that stalls, and slow poses logged at a higher rate, hold the last one.
 
     Such a pose ends by a leap: at more than ``_LEAPS`` times the pace around it, but over the whole time that it was
     held, at no less than ``_MOVING`` of the usual one. From true rest a vehicle starts slowly. A pose held to the end
     counts likewise if the vehicle got there at such a pace. Where most poses are held, all that repeat are.
     """
-    T, t_s = truth.T_world_cam, (truth.t_ns - truth.t_ns[:1]) * 1e-9
+    t_s = (t_ns - t_ns[:1]) * 1e-9
     repeats = np.append(np.zeros(len(T[:1]), bool), (T[1:] == T[:-1]).all(axis=(1, 2)))
     new = np.flatnonzero(~repeats)
     if len(new) == len(T) or len(new) < 3:
-        return truth
+        return np.zeros(len(T), dtype=bool)
     moved = se3.inverse(T[new[:-1]]) @ T[new[1:]]
     held, judged = np.zeros((2, len(new)), dtype=bool)
     for size in sizes(moved):
@@ -50,9 +50,17 @@ def without_held(truth: TruthLog) -> TruthLog:
         judged |= np.append(moving, moving[-1])
         held |= np.append(moving & (leap > _LEAPS * around), moving[-1])
     held |= held.sum() > 0.5 * judged.sum()
-    keep = ~(repeats & held[np.cumsum(~repeats) - 1])
+    return np.asarray(repeats & held[np.cumsum(~repeats) - 1], dtype=np.bool_)
+
+
+def without_held(truth: TruthLog) -> TruthLog:
+    """The truth without its :func:`held_poses`."""
+    held = held_poses(truth.t_ns, truth.T_world_cam)
+    if not held.any():
+        return truth
     v = truth.v_world_mps
-    return replace(truth, t_ns=truth.t_ns[keep], T_world_cam=T[keep], v_world_mps=None if v is None else v[keep])
+    moved = None if v is None else v[~held]
+    return replace(truth, t_ns=truth.t_ns[~held], T_world_cam=truth.T_world_cam[~held], v_world_mps=moved)
 
 
 def interpolate_truth(

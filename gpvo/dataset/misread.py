@@ -20,13 +20,15 @@ from gpvo.types import Array, TruthLog, VoLog
 @dataclass(frozen=True)
 class FixedRotation:
     """``rotvec_rad`` (3,) from the truth's camera to the log's, and ``lever_m`` between their origins, 0 where a lever
-    arm does not matter; ``error_change``: relative change without them of the median error over a second, on the halves
-    of the run that they were not fitted to."""
+    arm does not matter; ``scale``: size of the odometry's motions relative to the truth's, likewise 1;
+    ``error_change``: relative change without them of the median error over a second, on the halves of the run that they
+    were not fitted to."""
 
     angle_deg: float
     rotvec_rad: tuple[float, ...]
     error_change: float
     lever_m: float = 0.0
+    scale: float = 1.0
 
 
 MATTERS = -0.1
@@ -34,26 +36,54 @@ MATTERS = -0.1
 
 
 def fixed_rotation(log: VoLog, truth: TruthLog) -> FixedRotation | None:
-    """A fixed rotation between truth and odometry, and a lever arm if it matters beside that; None where neither shows
-    or matters."""
+    """A fixed rotation between truth and odometry, a lever arm if it matters beside that, and a scale if it matters
+    beside both, which they may only stand in for; None where none shows or matters."""
     A, B, _ = windowed_motions(log, truth)
     half, found = len(A) // 2, None
     if half < MIN_MOTIONS:
         return None
     parts = slice(None, half), slice(half, None)
-    try:
-        plain = least = np.array([np.median(_errors(A[p], B[p], np.eye(4))[0]) for p in parts])
-        for lever_arm in (False, True):
-            X = [fit_fixed_transform(A[p], B[p], lever_arm=lever_arm).T_log_truth for p in parts]
-            fixed = fit_fixed_transform(A, B, lever_arm=lever_arm)
-            left = np.array([np.median(_errors(A[p], B[p], x)[0]) for p, x in zip(parts, X[::-1])])
+    plain = least = _errors_of_halves(A, B)
+    for by_scale in (False, True):
+        for fit in ("none", "rotation", "transform")[1 - by_scale :]:
+            try:
+                fits = [_fitted(A[p], B[p], fit, by_scale) for p in (slice(None), *parts[::-1])]
+            except GpvoError:  # a path too straight to tell
+                continue
+            left = np.array([np.median(_errors(_sized(A[p], s), B[p], X)[0]) for p, (X, s) in zip(parts, fits[1:])])
             if _change(left, least, B).max() <= MATTERS:
-                rotvec = tuple(se3.so3_log(fixed.T_log_truth[:3, :3]).tolist())
-                change = float(_change(left, plain, B).mean())
-                found, least = FixedRotation(fixed.angle_deg, rotvec, change, fixed.lever_m), left
-    except GpvoError:  # a path too straight to tell
-        pass
+                (X, scale), change = fits[0], float(_change(left, plain, B).mean())
+                rotvec, lever_m = se3.so3_log(X[:3, :3]), float(np.linalg.norm(X[:3, 3]))
+                angle_deg = float(np.rad2deg(np.linalg.norm(rotvec)))
+                found, least = FixedRotation(angle_deg, tuple(rotvec.tolist()), change, lever_m, scale), left
     return found
+
+
+_ROUNDS = 5
+
+
+def _fitted(A: Array, B: Array, fit: str, by_scale: bool) -> tuple[Array, float]:
+    """The fixed transform (4, 4) between motions, and the scale of A, 1 if it is not fitted: in turns, as a lever arm
+    changes the size of motions too."""
+    X, scale = np.eye(4), 1.0
+    for _ in range(_ROUNDS if by_scale else 1):
+        before, scale = scale, _scale(A, X @ B @ se3.inverse(X)) if by_scale else 1.0
+        if fit == "none" or (abs(scale - before) < _SLIGHT and not np.array_equal(X, np.eye(4))):
+            break
+        X = fit_fixed_transform(_sized(A, scale), B, lever_arm=fit == "transform").T_log_truth
+    return X, scale
+
+
+def _sized(A: Array, scale: float) -> Array:
+    """Motions (M, 4, 4) of another scale."""
+    return se3.from_rt(A[:, :3, :3], A[:, :3, 3] / max(scale, 1e-12))
+
+
+def _scale(A: Array, B: Array) -> float:
+    """Size of the motions A (M, 4, 4) relative to B: the median over those that travel; 0 where none do."""
+    own, true = sizes(A)[0], sizes(B)[0]
+    moving = true > 0.5 * np.sqrt((true**2).mean())
+    return float(np.median(own[moving] / true[moving])) if moving.any() else 0.0
 
 
 @dataclass(frozen=True)
@@ -139,8 +169,8 @@ def resemblance(log: VoLog, truth: TruthLog) -> Resemblance | None:
         one_rests = (moves[0] and ratio > _TIMES_REST) or (true_moves[0] and ratio < 1 / _TIMES_REST)
         return Resemblance(ratio, 1.0, 0.0, 1.0) if one_rests else None
     moving = size > 0.5 * np.sqrt((size**2).mean(axis=1, keepdims=True))
-    scale = float(np.median(sizes(A)[0, moving[0]] / size[0, moving[0]]))
-    A[:, :3, 3] /= max(scale, 1e-12)
+    scale = _scale(A, B)
+    A = _sized(A, scale)
     try:
         X = fit_fixed_transform(A, B).T_log_truth
     except GpvoError:  # a path too straight to tell

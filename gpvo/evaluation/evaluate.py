@@ -14,7 +14,7 @@ from gpvo.accumulation import along
 from gpvo.dataset.build import aligned, predictions_of
 from gpvo.dataset.check import check, predictor_of
 from gpvo.dataset.clock import on_clock_of_log
-from gpvo.dataset.doubtful import Stretch, jumps, odd_stretches, without_wandering_truth
+from gpvo.dataset.doubtful import Stretch, in_waits, jumps, odd_stretches, without_wandering_truth
 from gpvo.dataset.errors import (
     MAX_GAP_S,
     MotionErrors,
@@ -184,9 +184,8 @@ def evaluate_run(
     )
     found = list(map(judge, made))  # each statement is let go before the next
     first = int(np.flatnonzero(known)[0])
-    trajectory = trajectory_errors(
-        log.t_ns[known], T_est[known], T_true[known], options.segments_m, np.flatnonzero(known)
-    )
+    number = np.arange(len(log)) + np.cumsum(in_waits(log, [s.t_ns for s in leaps]))  # no window over a jump is whole
+    trajectory = trajectory_errors(log.t_ns[known], T_est[known], T_true[known], options.segments_m, number[known])
     if blind:
         trajectory = TrajectoryErrors.of_positions(trajectory.path_length_m, trajectory.ate_rmse_m)
     lift = T_true[first] @ np.linalg.inv(T_est[first])

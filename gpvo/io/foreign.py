@@ -44,7 +44,7 @@ PLACES = {
 _GROWS, _GROWS_SEEN = 1e-6, 1e-3
 _NAMED = 12  # columns in a remark
 MIXED_AXES = "the rotation's covariances are read as in the body's axes, as OpenVINS has them (--covariance-axes)"
-NONE_STATED = "its covariances are not positive definite and were left out"
+NONE_STATED = "its covariances are NaN or not positive definite and were left out"
 
 
 def is_optical(frame_id: str) -> bool:
@@ -97,6 +97,15 @@ class ForeignLog:
         """The same log with its stamps moved by ``seconds``."""
         moved = Trajectory(self.t_ns + round(seconds * 1e9), self.trajectory.T_world_body)
         return replace(self, trajectory=moved)
+
+    def rows(self, keep: NDArray[np.bool_]) -> ForeignLog:
+        """The rows ``keep`` (N,). Of a motion over rows that are left out, no covariance is stated."""
+        cov = self.covariance
+        if cov is not None and self.covariance_of == "motion":
+            cov = np.where(np.append(True, keep[:-1])[:, None, None], cov, np.nan)
+        poses = Trajectory(self.t_ns[keep], self.trajectory.T_world_body[keep])
+        columns = {name: values[keep] for name, values in self.columns.items()}
+        return replace(self, trajectory=poses, covariance=None if cov is None else cov[keep], columns=columns)
 
     def seen_from(self, T_body_cam: Array) -> ForeignLog:
         """The same log for a camera that sits at ``T_body_cam`` (4, 4) on the body it describes."""

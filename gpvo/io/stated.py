@@ -163,7 +163,7 @@ def _motion_covariances(log: ForeignLog, motions: Array) -> tuple[str, Array | N
     if log.covariance is None:
         return "", None, []
     C = symmetrise(log.covariance)
-    if np.isfinite(C).all(axis=(1, 2)).any() and not are_covariances(C).any():
+    if not are_covariances(C).any():
         return "", None, [NONE_STATED]
     if log.covariance_of == "motion":
         return IMPORTED, C, _if_of_poses(C[1:], motions)

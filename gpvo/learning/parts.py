@@ -269,6 +269,7 @@ PRIORS = (9.0, 0.3)
 """Windows that the correlations of single motions may count for, as what to expect of each part."""
 _ROUNDS, _CONVERGED = 100, 1e-3
 _OVERLAP = 4
+_EXACT = 1e-5  # of the largest deviation, as of simulated motions: sums lose the digits of what is less
 
 
 def curves(spans: NDArray[np.int64], tau_frames: float) -> Array:
@@ -327,7 +328,8 @@ def _balanced(N: Array, M: Array) -> Array:
 def _scaled_sums(error: Chains, sigma: Chains, m: int) -> Array:
     """(w, D) sums over m motions, over their stated deviation if independent; each axis has unit mean square. Of
     windows that hold nearly the same motions, some are enough."""
-    pairs = [(e, s) for es, ss in zip(error, sigma) for e, s in zip(es, ss) if len(e) >= m]
+    pairs = [(moving_sums(e, m), moving_sums(s**2, m)) for es, ss in zip(error, sigma) for e, s in zip(es, ss)]
     some = slice(None, None, max(m // _OVERLAP, 1))
-    z = np.concatenate([moving_sums(e, m)[some] / np.sqrt(moving_sums(s**2, m)[some]) for e, s in pairs])
+    least = _EXACT**2 * np.max([s2.max(axis=0) for _, s2 in pairs if len(s2)], axis=0)
+    z = np.concatenate([e[some] / np.sqrt(np.maximum(s2, least)[some]) for e, s2 in pairs])
     return np.asarray(z / np.sqrt((z**2).mean(axis=0)))

@@ -6,7 +6,7 @@ from __future__ import annotations
 
 import tracemalloc
 from dataclasses import replace
-from itertools import accumulate
+from itertools import accumulate, pairwise
 from pathlib import Path
 
 import numpy as np
@@ -20,7 +20,7 @@ from gpvo.evaluation.evaluate import EvaluateOptions, evaluate_run
 from gpvo.evaluation.score import score_sequence, write_statements
 from gpvo.geometry import se3
 from gpvo.io import open_source
-from gpvo.io.run import read_run
+from gpvo.io.run import Run, read_run
 from gpvo.io.trajectory import read_tum
 from gpvo.learning.config import TrainConfig
 from gpvo.learning.fit import fit_model
@@ -28,7 +28,7 @@ from gpvo.learning.train import estimate_set
 from gpvo.runner import run, steps
 from gpvo.sim.points import simulate_points
 from gpvo.stats.consistency import nll_per_dim
-from gpvo.types import ImuMoments, Status, StereoCamera, TruthLog, VoLog, VoRecord
+from gpvo.types import ImuMoments, Mounting, Status, StereoCamera, TruthLog, VoLog, VoRecord
 from gpvo.vo.config import make_config
 from scipy.ndimage import percentile_filter
 from synthetic_runs import make_run
@@ -328,6 +328,16 @@ def test_a_slip_is_no_stretch(rate_hz):
     assert odd_stretches(log, replace(truth, T_world_cam=T)) == []
 
 
+@pytest.mark.parametrize("size", [0.3, 5.0])
+def test_a_slip_askew_is_no_odd_stretch_either(size):
+    """A closed loop, or another map: what it makes of a window is partly along other axes than its own."""
+    for seed in range(8):
+        log, truth = white_noise_run(seed, 10, stepped=False)
+        slip = se3.exp(size * np.random.default_rng(seed).standard_normal(6) * [1, 1, 1, 0.2, 0.2, 0.2])
+        records = [replace(r, T_prev_cur=r.T_prev_cur @ slip) if k == 150 else r for k, r in enumerate(log.records)]
+        assert odd_stretches(VoLog(records, None), truth) == []
+
+
 @pytest.mark.filterwarnings("error")
 @pytest.mark.parametrize("rate_hz", [10, 200])
 def test_a_log_at_rest_has_none_and_no_warnings(rate_hz):
@@ -375,3 +385,26 @@ def test_no_noise_of_the_truth_looks_like_a_jump():
     for sigma_m in (0.001, 0.01, 0.1):
         noise = np.random.default_rng(0).standard_normal((len(truth.t_ns), 6)) * ([sigma_m] * 3 + [0.1 * sigma_m] * 3)
         assert jumps(log, replace(truth, T_world_cam=truth.T_world_cam @ se3.exp(noise))) == []
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_markers_that_are_confused_between_frames_are_seen_at_the_rate_of_the_truth(seed):
+    """Motion capture at 100 Hz turns by a quarter for 20 ms to 8 s. Between frames at 10 Hz, a vehicle may turn so."""
+    fast, truth = white_noise_run(seed, 100, stepped=False)
+    T_est, rng = fast.trajectory()[::10], np.random.default_rng(seed)
+    motions = se3.inverse(T_est[:-1]) @ T_est[1:]
+    t = fast.t_ns[::10].tolist()
+    records = [VoRecord(b, a, Status.OK, M) for (a, b), M in zip(pairwise(t), motions, strict=True)]
+    log = VoLog([VoRecord(t[0], t[0], Status.START, np.eye(4)), *records])
+    assert jumps(log, truth) == []
+    T, wrong = truth.T_world_cam.copy(), np.zeros(len(log), dtype=bool)
+    for first, lasts in zip((320, 560, 820), (rng.integers(2, 90), rng.integers(90, 110), 800), strict=True):
+        confused = slice(first, first + lasts)
+        T[confused] = T[confused] @ se3.exp(np.array([0.03, -0.02, 0.01, 0.0, np.pi / 2, 0.0]))
+        off = np.isin(np.arange(len(log)) * 10, np.arange(len(T))[confused])
+        wrong |= off | np.append(False, off[:-1])
+    turned = replace(truth, T_world_cam=T)
+    found = jumps(log, turned)
+    np.testing.assert_array_equal(in_waits(log, [s.t_ns for s in found]), wrong)
+    run = Run(Path("mocap"), "mocap", log, turned, None, Mounting(), [])
+    assert np.rad2deg(evaluate_run(run).trajectory.rpe_frame.rotation_rad.max) < 5.0

@@ -13,7 +13,7 @@ import pytest
 from evaluation_runs import START_NS, make_run
 from gpvo.dataset.build import build
 from gpvo.dataset.errors import interpolate_truth, interpolation_sigma, turn_without_truth_deg
-from gpvo.dataset.misread import FixedRotation
+from gpvo.dataset.misread import FixedRotation, fixed_rotation
 from gpvo.errors import GpvoError, SourceError
 from gpvo.evaluation.consistency import BY_MODEL
 from gpvo.evaluation.evaluate import EvaluateOptions, Evaluation, evaluate_run, unjudged_run
@@ -189,6 +189,33 @@ def test_another_unit_is_named(factor: float, told: bool) -> None:
     lines = verdict(of_truth(lambda truth: scaled(truth, factor))).lines
     assert any("times as large as the truth's: are both in metres?" in line for line in lines) == told
     assert any("Are the baseline and the focal length right?" in line for line in lines) == told
+    assert any("1.11 times as large as the truth's: a wrong baseline" in line for line in lines) == (factor == 0.9)
+
+
+def test_odometry_propagated_between_corrections_is_told_from_a_truth_that_was_made_of_it() -> None:
+    log, truth = make_run(600, v_t=False)
+    exact = se3.inverse(truth.T_world_cam[:-1]) @ truth.T_world_cam[1:]
+    some = [r if k % 10 == 0 else replace(r, T_prev_cur=exact[k - 1]) for k, r in enumerate(log)]
+    found = verdict(evaluate_run(Run(Path("imu"), "imu", replace(log, records=some), truth, None, Mounting(), [])))
+    assert not found.judged
+    assert "or is odometry propagated between corrections" in found.headline
+
+
+@pytest.mark.parametrize("factor", [0.9, 1.05, 2.5])
+@pytest.mark.parametrize("lever_m", [0.0, 0.4])
+def test_a_scale_is_not_taken_for_a_lever_arm_nor_hides_one(factor: float, lever_m: float) -> None:
+    """A camera alone, or a wrong baseline: a lever arm that stood in for it was named, with what would fit it."""
+    X = se3.exp(np.array([lever_m, 0.0, 0.0, 0.2, 0.0, 0.0])) if lever_m else np.eye(4)
+    log, truth = make_run(600, v_t=False)
+    log = replace(log, records=[replace(r, T_prev_cur=_scaled(r.T_prev_cur, factor)) for r in log])
+    found = fixed_rotation(log, replace(truth, T_world_cam=truth.T_world_cam @ X))
+    assert found is not None
+    assert found.scale == pytest.approx(factor, rel=0.03 if lever_m else 0.01)
+    assert found.lever_m == pytest.approx(lever_m, abs=0.05)
+
+
+def _scaled(T: Array, factor: float) -> Array:
+    return se3.from_rt(T[:3, :3], factor * T[:3, 3])
 
 
 def _other_flight(truth: TruthLog) -> TruthLog:

@@ -197,15 +197,17 @@ def test_pose_covariance_of_a_filter_is_not_passed_off_as_a_motions(tmp_path):
     assert set(records[5].covariances) == {"imported_pose"}
 
 
+@pytest.mark.parametrize("empty", [0.0, np.nan])
 @pytest.mark.parametrize(("zeros", "covariance_of"), [(6, "pose"), (3, "pose"), (3, "motion")])
-def test_covariances_that_state_nothing_are_left_out_with_one_remark(tmp_path, zeros, covariance_of):
-    """All zeros, or zeros for the rotation, are a placeholder; they were said to grow as a filter's."""
-    variances = [np.full(N, 0.0 if i >= 6 - zeros else 1e-4) for i in range(6)]
+def test_covariances_that_state_nothing_are_left_out_with_one_remark(tmp_path, zeros, covariance_of, empty):
+    """All zeros, or zeros for the rotation, are a placeholder, as is NaN; they were said to grow as a filter's, or left
+    out without a word."""
+    variances = [np.full(N, empty if i >= 6 - zeros else 1e-4) for i in range(6)]
     header = "t_ns,p_x,p_y,p_z,q_x,q_y,q_z,q_w," + ",".join(f"cov_{i}{i}" for i in range(6))
     log = read_foreign(_csv(tmp_path / "a.csv", header, variances), covariance_of=covariance_of)
     records, notes = to_records(log)
     assert not any(r.covariances for r in records)
-    assert notes == ["its covariances are not positive definite and were left out"]
+    assert notes == ["its covariances are NaN or not positive definite and were left out"]
 
 
 def test_a_motion_that_is_stated_as_unknown_is_lost(tmp_path):

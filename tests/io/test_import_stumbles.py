@@ -12,11 +12,13 @@ import sequences as seq
 from bag_maker import BagMaker, stereo_bag
 from gpvo.cameras.readers import read_stereo_yaml
 from gpvo.cli.files import import_log
+from gpvo.dataset.errors import motion_errors
 from gpvo.errors import CalibrationError, SourceError
+from gpvo.geometry import se3
 from gpvo.io import open_source
-from gpvo.io.foreign import read_foreign
+from gpvo.io.foreign import ForeignLog, read_foreign
 from gpvo.io.run_read import read_run
-from gpvo.io.trajectory import read_tum
+from gpvo.io.trajectory import Trajectory, read_tum, write_tum
 
 POSE = "0,0,0,0,0,0,1"
 
@@ -70,6 +72,41 @@ def test_odometry_of_a_bag_that_is_not_used_is_named_with_the_option_that_takes_
     assert log.other_topics == ("/vicon/head/head",)
     notes = import_log(log, None, tmp_path / "run").notes
     assert any("/vicon/head/head" in n and "--truth-topic" in n for n in notes)
+
+
+def _stalling(path: Path, held: np.ndarray) -> tuple[Path, Path]:
+    """Odometry at 10 Hz whose rows ``held`` (N,) repeat the pose before, and its exact truth."""
+    s = np.arange(len(held)) * 0.1
+    t_ns = np.rint(s * 1e9).astype(np.int64)
+    T = se3.from_rt(se3.so3_exp(np.outer(0.3 * np.sin(s), [0, 1, 0])), np.stack([np.cos(s), 0 * s, 1.5 * s], 1))
+    rows = np.maximum.accumulate(np.where(held, 0, np.arange(len(s))))
+    write_tum(path / "truth.tum", t_ns, T)
+    write_tum(path / "log.tum", t_ns, T[rows])
+    return path / "log.tum", path / "truth.tum"
+
+
+@pytest.mark.parametrize("frozen", [False, True])
+def test_poses_that_odometry_only_repeats_are_no_motions(tmp_path: Path, frozen: bool) -> None:
+    """One in ten, as of slower odometry logged at a fixed rate; or two seconds, as while it is lost. They made errors
+    of half a motion and more, and a model learned these."""
+    rng = np.random.default_rng(0)
+    held = (np.arange(300) // 20 == 7) if frozen else (rng.random(300) < 0.1) & (np.arange(300) > 0)
+    log, truth = (read_foreign(path) for path in _stalling(tmp_path, held))
+    summary = import_log(log, truth, tmp_path / "run")
+    assert any(f"{held.sum()} of 300 poses" in n for n in summary.notes)
+    run = read_run(tmp_path / "run")
+    np.testing.assert_array_equal(run.log.t_ns, log.t_ns[~held])
+    assert run.truth is not None
+    assert np.abs(motion_errors(run.log, run.truth).xi).max() < 1e-6
+
+
+def test_a_log_without_the_rows_that_repeat_states_nothing_of_motions_over_them() -> None:
+    T = np.tile(np.eye(4), (4, 1, 1))
+    log = ForeignLog(Path("a"), Trajectory(np.arange(4), T), np.tile(np.eye(6), (4, 1, 1)), columns={"x": np.arange(4)})
+    kept = log.rows(np.array([True, True, False, True]))
+    assert kept.columns["x"].tolist() == [0, 1, 3] == kept.t_ns.tolist()
+    assert kept.covariance is not None
+    assert np.isfinite(kept.covariance).all(axis=(1, 2)).tolist() == [True, True, False]
 
 
 def _camera_info(path: Path, tx: float) -> None:

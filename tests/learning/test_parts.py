@@ -212,3 +212,14 @@ def test_sums_over_more_than_two_time_constants_share_the_doubt_of_shorter_ones(
     np.testing.assert_array_equal(found.widening(64.0)[:, 0], [1.01, 1.1, 1.3, 1.3])
     np.testing.assert_array_equal(found.widening(1024.0)[:, 0], [1.01, 1.1, 1.3, 2.0])
     np.testing.assert_array_equal(found.widening(0.1)[:, 0], np.full(4, 1.01))
+
+
+def test_motions_that_are_all_but_exact_beside_others_leave_correlations_finite():
+    """As of a simulator, or of an IMU between corrections; sums of variances lost the digits of the least, and training
+    ended in a traceback."""
+    rng = np.random.default_rng(0)
+    exact = np.tile(np.arange(1000) % 10 > 0, (2, 1)) & (np.arange(1000) < 800)
+    sigma = [[np.where(of[:, None], 1e-11, 3e-3) * np.ones(6)] for of in exact]
+    error = [[s[0] * rng.standard_normal((1000, 6))] for s in sigma]
+    parts = fit_parts(error, sigma, _same_speed(error), 0.02)
+    assert np.isfinite(part_correlations(error, sigma, parts)).all()
