@@ -3,7 +3,8 @@
 Noise with a sign of its own on each track averages out over a frame. Imperfect matching that depends on the place in
 the image, jitter between the cameras, objects and foreshortening do not. Each channel u, v, d of the field is
 ``c_k . (1, x, y, x^2, xy, y^2)`` [px] in frame k, with the image scaled to [-1, 1]; the 18 coefficients have one
-variance for (u, v) and one for d, of each kind (:data:`KINDS`) of dependence on time.
+variance for (u, v) and one for d, of each kind (:data:`KINDS`) of dependence on time. What adds up from frame to frame
+is as large as the image moves: how a point looks changes with the view of it, and not while the vehicle rests.
 
 The residuals of a motion (measured minus moved, ``e = r_k - G r_{k-1}``, whitened), with its six directions A projected
 out, say of the 18 modes F ``S_k = F' (1 - A A^+) e``, to which increments ``c_k`` of a field add ``N_k c_k``, with
@@ -40,14 +41,18 @@ _DRAWS, _FIELDS = 99, 24  # a run is beyond all the draws by chance once in a hu
 _WORTH = 1.25  # less changes sigma by no more than an eighth
 _MIN_PAIRS, _MIN_MOTIONS, _MIN_BLOCKS = 20, 40, 4
 _MAX_GAP, _LARGEST = 3, 4.0  # frames between two views of a pair, as over a repeat; whitened residuals count no more
+Pairs = tuple[NDArray[np.int64], NDArray[np.int64]]
 
 
 @dataclass(frozen=True)
 class CommonField:
-    """``variance_px2`` (4, 2) by kind, of (u, v) and of d; zero where none is. ``step_s``: median between frames."""
+    """``variance_px2`` (4, 2) by kind, of (u, v) and of d; zero where none is. ``step_s``: median between frames.
+    ``pace`` (F,): how far the image moves, over the usual: increments are as large, as nothing changes while it rests.
+    """
 
     variance_px2: Array
     step_s: float
+    pace: Array
 
     @classmethod
     def of(
@@ -57,12 +62,14 @@ class CommonField:
         ``t_ns`` (F,) stamps. None is found where fewer than forty motions have twenty points.
         """
         step_s = max(float(np.median(np.diff(t_ns))) * 1e-9, 1e-6) if len(t_ns) > 1 else 1.0
-        S, N = _modes(seen, structure, noise_px, signs)
+        pairs = _pairs(seen, structure)
+        S, N = _modes(seen, structure, noise_px, signs, pairs)
+        pace = _pace(seen, len(S), pairs)
         lengths = [max(1, round(s / step_s)) for s in _BLOCKS_S]
         lengths = [n for n in dict.fromkeys(lengths) if len(S) // n >= _MIN_BLOCKS]
         variance = np.zeros((len(KINDS), 2))
         if (N[:, 0, 0] > 0).sum() < _MIN_MOTIONS:
-            return cls(variance, step_s)
+            return cls(variance, step_s, pace)
         energy = _block_energies(S, N, lengths)
         total = (energy / energy.std(axis=0)).sum(axis=1)
         if total[0] > total[1:].max() and (energy[0] / energy[1:].mean(axis=0)).mean() > _WORTH:
@@ -71,11 +78,11 @@ class CommonField:
             for kind, channel in itertools.product(range(len(KINDS)), range(2)):
                 if _TAU_S[kind] <= lengths[-1] * step_s:  # longer than the blocks, it could not be told
                     c = _drawn(kind, (len(S), _FIELDS, 18), step_s, rng) * _CHANNELS[channel]
-                    c = np.diff(c, axis=0, prepend=0.0) if kind == 0 else c
+                    c = np.diff(c, axis=0, prepend=0.0) if kind == 0 else c * pace[:, None, None]
                     units[kind, channel] = _block_energies(c @ N, N, lengths).mean(axis=0) / scatter
             excess = (energy[0] - energy[1:].mean(axis=0)) / scatter
             variance = nnls(units.reshape(-1, len(scatter)).T, excess)[0].reshape(-1, 2)
-        return cls(variance, step_s)
+        return cls(variance, step_s, pace)
 
     def draw(self, seen: Observations, rng: np.random.Generator) -> Array:
         """(M, 3) the field [px] at the observations."""
@@ -86,7 +93,8 @@ class CommonField:
         )
         order = np.lexsort((seen.frame, seen.track))
         first = np.diff(seen.track[order], prepend=-1) != 0
-        gathered = np.where(first[:, None], 0.0, _at(sum(steps, np.zeros_like(level)), seen)[order]).cumsum(axis=0)
+        moved = self.pace[: shape[0], None] * sum(steps, np.zeros_like(level))
+        gathered = np.where(first[:, None], 0.0, _at(moved, seen)[order]).cumsum(axis=0)
         field = _at(level, seen)
         field[order] += gathered - gathered[first][np.cumsum(first) - 1]
         return field
@@ -134,7 +142,7 @@ def _at(c: Array, seen: Observations) -> Array:
     return np.stack([np.einsum("mb,mb->m", B, c[seen.frame, i : i + 6]) for i in (0, 6, 12)], axis=1)
 
 
-def _pairs(seen: Observations, structure: Structure) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+def _pairs(seen: Observations, structure: Structure) -> Pairs:
     """Consecutive observations of a track that the fit used, in order of the later frame."""
     order = np.lexsort((seen.frame, seen.track))
     order = order[structure.weight[order] > 0]
@@ -144,11 +152,20 @@ def _pairs(seen: Observations, structure: Structure) -> tuple[NDArray[np.int64],
     return a[paired][by_frame], b[paired][by_frame]
 
 
+def _pace(seen: Observations, frames: int, pairs: Pairs) -> Array:
+    """(F,) median way [px] of the points since the frame before, over its root mean square; 0 where none is known."""
+    first, second = pairs
+    way = np.linalg.norm(seen.uvd[second, :2] - seen.uvd[first, :2], axis=1)
+    starts = np.searchsorted(seen.frame[second], np.arange(frames + 1))
+    px = np.array([np.median(way[i:j]) if j > i else 0.0 for i, j in itertools.pairwise(starts)])
+    return np.asarray(px / max(float(np.sqrt((px**2).sum() / max((px > 0).sum(), 1))), 1e-9))
+
+
 def _modes(
-    seen: Observations, structure: Structure, noise_px: Array, signs: NDArray[np.int8]
+    seen: Observations, structure: Structure, noise_px: Array, signs: NDArray[np.int8], pairs: Pairs
 ) -> tuple[NDArray[Any], Array]:
     """S (F, 1 + draws, 18) of the run and of the draws, and N (F, 18, 18)."""
-    first, second = _pairs(seen, structure)
+    first, second = pairs
     P, R, B = structure.in_camera(seen), structure.T_world_cam[:, :3, :3], _basis(seen)
     S, N = np.zeros((len(R), 1 + signs.shape[1], 18), np.float32), np.zeros((len(R), 18, 18))
     starts = np.searchsorted(seen.frame[second], np.arange(len(R) + 1))

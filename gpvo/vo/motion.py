@@ -250,11 +250,10 @@ def refine(
         # What is left of the residual is shared between the two frames: S G^T C^-1 (r - H step).
         left = z - np.einsum("ijn,j->in", A, step)
         smoothed = uvd_prev + _smoothing(S, moved.G, W, left, persistent)
+        converged = bool(step @ information @ step < (_AT_REST * scale) ** 2)
         if np.abs(step).max() < 1e-9 or (iteration > _CHOOSING and np.abs(step).max() < 1e-6):
             converged = True
             break
-    else:
-        converged = bool(step @ information @ step < (_AT_REST * scale) ** 2)
     return Motion(T, keep, scale, r[:, keep].T, smoothed[keep], information, converged, noise)
 
 

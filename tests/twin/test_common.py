@@ -21,11 +21,14 @@ CAMERA = StereoCamera(400.0, 400.0, 319.5, 239.5, 0.1, 640, 480)
 STEP_S, LIFE, PER_FRAME = 0.1, 8, 160
 
 
-def flight(seed: int, n_frames: int, field: CommonField | None = None) -> tuple[Observations, Structure]:
-    """Tracks of eight frames past which a camera flies forwards, with independent noise of 0.2 px
-    of each image coordinate, and a field."""
+def flight(
+    seed: int, n_frames: int, field: CommonField | None = None, rests: range = range(0)
+) -> tuple[Observations, Structure]:
+    """Tracks of eight frames past which a camera flies forwards, but not in the frames in which it rests, with
+    independent noise of 0.2 px of each image coordinate, and a field."""
     rng = np.random.default_rng(seed)
-    T = np.stack([se3.exp([0.002 * k, 0.0, 0.05 * k, 0.0, 0.001 * k, 0.0]) for k in range(n_frames)])
+    steps = np.cumsum([k not in rests for k in range(n_frames)]) - 1
+    T = np.stack([se3.exp([0.002 * k, 0.0, 0.05 * k, 0.0, 0.001 * k, 0.0]) for k in steps])
     begin = np.repeat(np.arange(1 - LIFE, n_frames), PER_FRAME // LIFE + 1)
     depth = rng.uniform(2.0, 15.0, len(begin))
     at = np.c_[rng.uniform([-0.7, -0.5], [0.7, 0.5], (len(begin), 2)) * depth[:, None], depth]
@@ -50,7 +53,7 @@ def found(seen: Observations, structure: Structure, seed: int = 0) -> CommonFiel
 
 def common(sd_px: dict[str, tuple[float, float]], step_s: float = STEP_S) -> CommonField:
     """Of these standard deviations, by kind."""
-    return CommonField(np.square([sd_px.get(kind, (0.0, 0.0)) for kind in KINDS]), step_s)
+    return CommonField(np.square([sd_px.get(kind, (0.0, 0.0)) for kind in KINDS]), step_s, np.ones(1000))
 
 
 @pytest.mark.parametrize("kind", KINDS)
@@ -69,6 +72,21 @@ def test_independent_noise_makes_no_field():
     none = [not found(*flight(seed, 150), seed).variance_px2.any() for seed in range(12)]
     # One in a hundred is beyond all draws by chance.
     assert sum(none) >= 11
+
+
+def test_increments_rest_with_the_image():
+    """What is mistaken about a point that comes nearer stays as it is while nothing does."""
+    seen, structure = flight(0, 200, rests=range(80, 120))
+    field = replace(
+        found(seen, structure), variance_px2=common({"white": (0.05, 0.05), "1 s": (0.05, 0.05)}).variance_px2
+    )
+    drawn = field.draw(seen, np.random.default_rng(0))
+    order = np.lexsort((seen.frame, seen.track))
+    same = np.diff(seen.track[order]) == 0
+    step = np.linalg.norm(np.diff(drawn[order], axis=0), axis=1)[same]
+    resting = np.isin(seen.frame[order][1:][same], range(80, 120))
+    assert step[resting].max() < 1e-9
+    assert np.median(step[~resting]) > 0.05
 
 
 def test_a_short_run_tells_of_none():
