@@ -88,6 +88,35 @@ def killed(share: float, command: list[object], look: Callable[[], None], takes_
     finish(*command)
 
 
+WINDING_DOWN = """
+import sys, threading, time
+from gpvo.__main__ import main
+
+def other_work():
+    threading.main_thread().join()
+    print("winding down", flush=True)
+    time.sleep(60)
+
+threading.Thread(target=other_work).start()
+sys.argv = ["gpvo", "--version"]
+main()
+"""
+
+
+@pytest.mark.parametrize("how", [signal.SIGTERM, signal.SIGHUP], ids=lambda how: how.name)
+def test_a_signal_after_the_work_is_done_says_nothing(how: signal.Signals) -> None:
+    """Python waits for threads, and so for worker processes, after the program's last line."""
+    with start(sys.executable, "-c", WINDING_DOWN) as call:
+        assert call.stdout is not None
+        while b"winding down" not in call.stdout.readline():
+            assert call.poll() is None
+        call.send_signal(how)
+        if how is signal.SIGHUP:  # all is written, and the end comes by itself: no matter that the terminal is gone
+            call.terminate()
+        _, err = call.communicate(timeout=30)
+    assert err == b""
+
+
 def bytes_of(path: Path) -> dict[str, bytes]:
     files = [path] if path.is_file() else [p for p in path.rglob("*") if p.is_file()]
     return {str(p.relative_to(path)): p.read_bytes() for p in files}
