@@ -85,7 +85,7 @@ def run(
     status: Counter[str] = Counter()
     length_m = busy_s = 0.0
     recorder = TrackRecorder() if keep_tracks else None
-    odometry = StereoOdometry(source.camera, config, source.mask, calibration_state)
+    odometry = StereoOdometry(source.camera, config, source.mask, calibration_state, source.mounting.T_imu_cam)
     of_model = "" if predictor is None else predictor.digest
     key = None if options is None else digest_of(options, of_model, keep_tracks, odometry, *_content(source))
     with (
@@ -159,7 +159,7 @@ def steps(
 
     Raises SourceError where these are of other frames.
     """
-    odometry = odometry or StereoOdometry(source.camera, config, source.mask)
+    odometry = odometry or StereoOdometry(source.camera, config, source.mask, T_imu_cam=source.mounting.T_imu_cam)
     t_last_ns: int | None = None
     for k, frame in enumerate(source):
         if k < _FRAMES_BEFORE_TRUST and isinstance(frame, TrackFrame):

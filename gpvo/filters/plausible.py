@@ -13,10 +13,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from gpvo.stats.series import Doubt, integral, interpolated
-from gpvo.types import Array, ImuLog
+from gpvo.types import MOST_MPS2, MOST_RADPS, Array, ImuLog
 
-MOST_RADPS, MOST_MPS2 = 30.0, 150.0
-"""A reading beyond is saturation or a fault: usual sensors end at 2000 deg/s and 16 g, and VO long before."""
 LONGEST_GAP_S = 1.0
 """A sample that comes later is believed when the next one confirms its clock."""
 _LIMITS = np.repeat([MOST_RADPS, MOST_MPS2], 3)

@@ -20,12 +20,12 @@ from gpvo.filters.imu_motion import (
     clock_shift,
     jerks,
 )
-from gpvo.filters.plausible import MOST_MPS2, MOST_RADPS, on_one_clock, usable
+from gpvo.filters.plausible import on_one_clock, usable
 from gpvo.filters.run import Flight
 from gpvo.filters.start import StartSigmas
 from gpvo.geometry import se3
 from gpvo.geometry.covariance import is_positive_definite
-from gpvo.types import STANDARD_GRAVITY_MPS2, Array, ImuLog
+from gpvo.types import MOST_MPS2, MOST_RADPS, STANDARD_GRAVITY_MPS2, Array, ImuLog
 
 # The 48 ways to call three axes by the wrong names and signs; the right one is the first.
 _RELABELLINGS = sorted(

@@ -181,7 +181,8 @@ class StereoStage:
             return
         begins = self._odometry is None
         if self._odometry is None:
-            self._odometry = StereoOdometry(self.camera, self.settings.config, self._rectifier.mask, self._state)
+            place = self._rectifier.mounting.T_imu_cam
+            self._odometry = StereoOdometry(self.camera, self.settings.config, self._rectifier.mask, self._state, place)
         record = self._odometry.step(frame, None if begins else self._imu_since(t_ns))
         self._t_last_ns = t_ns
         yield Taken(record, begins, received_ns)

@@ -18,6 +18,8 @@ from gpvo.types.records import (
     VoRecord,
 )
 from gpvo.types.sensors import (
+    MOST_MPS2,
+    MOST_RADPS,
     STANDARD_GRAVITY_MPS2,
     VEHICLES,
     Array,
@@ -41,6 +43,8 @@ __all__ = [
     "IMPORTED",
     "IMPORTED_POSE",
     "IMU_FIELDS",
+    "MOST_MPS2",
+    "MOST_RADPS",
     "STANDARD_GRAVITY_MPS2",
     "VEHICLES",
     "Array",

@@ -145,6 +145,10 @@ class ImuLog:
     noise: ImuNoise | None = None
 
 
+MOST_RADPS, MOST_MPS2 = 30.0, 150.0
+"""A reading of an IMU beyond is saturation or a fault: usual sensors end at 2000 deg/s and 16 g, and VO long before."""
+
+
 @dataclass(frozen=True)
 class Mounting:
     """Where the rectified left camera sits: ``T_body_cam`` and ``T_imu_cam`` (4, 4), None where unknown.

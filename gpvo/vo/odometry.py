@@ -27,6 +27,7 @@ from gpvo.vo.quality import (
     median_parallax_px,
     motion_fields,
     stats_fields,
+    worst_translation_sigma_m,
 )
 from gpvo.vo.rig_error import RigError, RigState
 from gpvo.vo.rivals import Choice, areas, choose, unexplained, untangled
@@ -34,6 +35,7 @@ from gpvo.vo.state import State, Stopwatch, own_frame
 from gpvo.vo.window import Window
 
 _RIVAL_STAYS = 0.85  # per frame
+_NO_VEHICLE = "no vehicle changes its velocity like this"
 
 
 class StereoOdometry:
@@ -46,6 +48,8 @@ class StereoOdometry:
     mask : (H, W) bool, True where the left image may be used. CalibrationError for one of another size.
     known : what is known about errors of the calibration; by default nothing, or, with ``self_calibration`` off, that
         there are none.
+    T_imu_cam : (4, 4) where the left camera sits on the IMU; None where that is unknown: then a velocity that leaps is
+        told by what the vehicle can do, not by what the IMU felt.
 
     Frames must be rectified, of the camera's size, and in time order. ``last``: the points behind the last motion, for
     drawing. ``pair``: what is wrong with the pairs of images; ``rig_error``: what is wrong with the calibration.
@@ -57,8 +61,9 @@ class StereoOdometry:
         config: VoConfig | None = None,
         mask: NDArray[np.bool_] | None = None,
         known: RigState | None = None,
+        T_imu_cam: Array | None = None,
     ) -> None:
-        self.camera = camera
+        self.camera, self._T_imu_cam = camera, T_imu_cam
         self.config = config or VoConfig()
         self._mask = None if mask is None else np.array(mask, bool)
         if self._mask is not None and self._mask.shape != (camera.height, camera.width):
@@ -92,9 +97,11 @@ class StereoOdometry:
         clock.lap("observe")
         if self._state is None:
             counts = frontend.promote(None)
-            self._state = State.begin(frame.t_ns, counts[1])
+            self._state = State.begin(frame.t_ns, counts[1], self._T_imu_cam)
             record = VoRecord(frame.t_ns, frame.t_ns, Status.START, np.eye(4), n_detected=counts[0], n_stereo=counts[1])
             return replace(record, stage_ms=clock.stages, **stats_fields(seen.stats), **ImuMoments.of(imu).fields())
+        piece = ImuMoments.of(imu)
+        self._state.feel(frame.t_ns, piece)
         guess = self._state.guess(frame.t_ns)
         matches, motion = self._solve(guess, clock)
         doubts = self.pair.step(seen, matches.right)
@@ -118,10 +125,10 @@ class StereoOdometry:
             status = Status.DEGRADED if record.status is Status.OK else record.status
             record = replace(record, status=status, reason=reason)
         clock.lap("covariance")
-        is_reference, counts = self._advance(record, matches, motion, tells=choice.tells)
+        is_reference, counts = self._advance(record, matches, motion, choice)
         self._window.advance(is_reference)
         clock.lap("reference")
-        sensed = self._imu.with_later(ImuMoments.of(imu))
+        sensed = self._imu.with_later(piece)
         self._imu = ImuMoments.of(None) if is_reference else sensed
         return replace(
             record,
@@ -188,20 +195,21 @@ class StereoOdometry:
             doubts.append(f"two motions, over {covered[0]} and {covered[1]} parts of the image")
         elif self._state.rivalry > 1.5:
             doubts.append("two motions in the frames before")
-        chosen = choose(motions, covered, self._state.expected(t_ns, guess, self.config.max_acceleration_mps2))
+        expected = self._state.expected(t_ns, guess, self.config.max_acceleration_mps2)
+        chosen = choose(motions, covered, expected)
         if len(motions) == 1 and chosen.plausible:  # a rival that is not found in one frame has not gone
-            chosen = replace(chosen, otherwise=_RIVAL_STAYS * self._state.otherwise)
-        self._state.odds, self._state.otherwise = chosen.odds, chosen.otherwise
+            chosen = replace(chosen, otherwise=_RIVAL_STAYS * self._state.in_doubt)
+        self._state.odds, self._state.in_doubt = chosen.odds, chosen.otherwise
         if not chosen.plausible:
-            doubts.append("no vehicle changes its velocity like this")
+            self._state.refuse(t_ns, motions[chosen.index].T_prev_cur)
+            is_felt = expected is not None and expected.felt
+            doubts.append("the IMU felt no such change of velocity" if is_felt else _NO_VEHICLE)
         elif chosen.tells and not chosen.goes_on:
             self._state.leap(t_ns, motions[chosen.index].T_prev_cur, self.config.max_acceleration_mps2)
-        left = self._state.leaps.doubted(t_ns)
+        left = self._state.otherwise(t_ns, motions[chosen.index].T_prev_cur, self.config.max_acceleration_mps2)
         if left is not None:
             doubts.append("the velocity leapt: what it was before may be the scene's")
-            T_before = se3.exp(left * (t_ns - self._state.t_ref_ns) * 1e-9)
-            d = se3.log(se3.inverse(motions[chosen.index].T_prev_cur) @ T_before)
-            chosen = replace(chosen, otherwise=chosen.otherwise + 0.5 * np.outer(d, d))
+            chosen = replace(chosen, otherwise=chosen.otherwise + left)
         return motions[chosen.index], chosen
 
     def _estimate(self, matches: Matches, among: NDArray[np.bool_] | None = None) -> Motion | None:
@@ -288,7 +296,7 @@ class StereoOdometry:
         )
 
     def _advance(
-        self, record: VoRecord, matches: Matches, motion: Motion | None, *, tells: bool
+        self, record: VoRecord, matches: Matches, motion: Motion | None, choice: Choice
     ) -> tuple[bool, tuple[int, int]]:
         """Choose the reference of the next motion; whether it is this frame, and the counts of points."""
         assert self._frontend is not None
@@ -308,7 +316,8 @@ class StereoOdometry:
             return True, counts
         inliers = motion.inliers
         parallax_px = median_parallax_px(matches, inliers)
-        state.believe(record.t_ns, record.T_prev_cur, parallax_px, int(inliers.sum()), tells=tells)
+        sigma_m = worst_translation_sigma_m(motion)
+        state.believe(record.t_ns, record.T_prev_cur, parallax_px, int(inliers.sum()), choice, sigma_m)
         if state.suffices(parallax_px, config) and inliers.sum() > 0.6 * state.reference_points:
             return False, (state.reference_points, state.reference_points)
         counts = self._frontend.promote(inliers if state.rival is None else state.rival, config.min_inliers)

@@ -37,12 +37,16 @@ _REGAINED = 0.3  # log odds, with each frame in which nothing speaks against the
 
 @dataclass(frozen=True)
 class Expected:
-    """``T_prev_cur`` (4, 4) at the last velocity, off which a vehicle is by ``reach_m`` at most; ``odds``: log odds
-    that this velocity is that against the scene, and not against something that moves in it."""
+    """``T_prev_cur`` (4, 4) at the last velocity, off which a vehicle is by ``reach_m`` at most, and by ``sigma_m`` on
+    each axis; ``odds``: log odds that this velocity is that against the scene, and not against something that moves in
+    it. ``T_refused`` (4, 4), at a velocity that the vehicle could not have."""
 
     T_prev_cur: Array
     reach_m: float
+    sigma_m: float
     odds: float
+    T_refused: Array | None = None
+    felt: bool = False  # an IMU says so
 
 
 @dataclass(frozen=True)
@@ -73,12 +77,13 @@ class Leaps:
     left_ns: int = 0
     until_ns: int = 0
 
-    def step(self, t_ns: int, now: Array, last: Array, t_last_ns: int, max_acceleration_mps2: float) -> None:
-        """The velocity leapt to ``now`` (6,) at ``t_ns``, from ``last`` (6,) at ``t_last_ns``."""
+    def step(self, t_ns: int, now: Array, last: Array, t_last_ns: int, reach_mps: float) -> None:
+        """The velocity leapt to ``now`` (6,) at ``t_ns``, from ``last`` (6,) at ``t_last_ns``; a vehicle can be off the
+        one that was left by ``reach_mps``."""
         if self.before is None:
             self.before, self.left_ns = last, t_last_ns
             self.until_ns = t_ns + min(t_last_ns - self.began_ns, _LONGEST_DOUBT_NS)
-        elif np.linalg.norm((now - self.before)[:3]) <= max_acceleration_mps2 * (t_ns - self.left_ns) * 1e-9:
+        elif np.linalg.norm((now - self.before)[:3]) <= reach_mps:
             self.before = None
         self.began_ns = t_ns
 
@@ -93,21 +98,13 @@ def choose(motions: Sequence[Motion], covered: Sequence[int], expected: Expected
     """The likeliest of the motions to be the scene's: the one that goes on as expected, until the parts of the image
     have spoken long enough for another. Where none goes on, what was expected is a candidate of its own.
 
-    Moments of the mixture: ``sum p_i d_i d_i^T``, with d_i from the chosen motion to another.
+    Moments of the mixture: ``sum p_i (d_i d_i^T + C_i)``, with d_i from the chosen motion to another, and C_i of what
+    was expected alone.
     """
+    weight, goes_on, tells = _weigh(motions, covered, expected)
     candidates = [m.T_prev_cur for m in motions]
-    # Half a cell for one that explains none better than the other does.
-    weight = _AREA * np.log(np.maximum(covered[: len(motions)], 0.5))
-    goes_on, tells = np.ones(len(motions), bool), np.ones(len(motions), bool)
-    if expected is not None:
-        off_m = np.array([np.linalg.norm((se3.inverse(expected.T_prev_cur) @ T)[:3, 3]) for T in candidates])
-        noise_m = np.array([_NOISE * worst_translation_sigma_m(m) for m in motions])
-        goes_on = (off_m <= np.hypot(expected.reach_m, noise_m)) & (off_m == off_m.min())
-        tells = np.minimum(off_m, noise_m) <= expected.reach_m
-        weight = weight + expected.odds * goes_on
-        if not goes_on.any():
-            candidates.append(expected.T_prev_cur)
-            weight = np.append(weight, weight.max() + expected.odds + _UNSEEN)
+    if len(weight) > len(motions) and expected is not None:
+        candidates.append(expected.T_prev_cur)
     best, likeliest = int(np.argmax(weight[: len(motions)])), int(np.argmax(weight))
     plausible = best == likeliest
     if len(candidates) > 1:
@@ -119,7 +116,36 @@ def choose(motions: Sequence[Motion], covered: Sequence[int], expected: Expected
     share = np.maximum(share / share.sum(), np.exp(-_SUREST) / (1 + np.exp(-_SUREST)))
     d = np.stack([se3.log(se3.inverse(candidates[best]) @ T) for T in candidates])
     otherwise = np.einsum("i,ij,ik->jk", share, d, d)
+    if len(candidates) > len(motions) and expected is not None:
+        otherwise[:3, :3] += share[-1] * expected.sigma_m**2 * np.eye(3)
     return Choice(best, otherwise, plausible, plausible and bool(tells[best]), min(odds, _SUREST), bool(goes_on[best]))
+
+
+def _weigh(
+    motions: Sequence[Motion], covered: Sequence[int], expected: Expected | None
+) -> tuple[Array, NDArray[np.bool_], NDArray[np.bool_]]:
+    """Log odds of each motion, and of what was expected where none goes on; which goes on; which tell the velocity."""
+    # Half a cell for one that explains none better than the other does.
+    area = _AREA * np.log(np.maximum(covered[: len(motions)], 0.5))
+    if expected is None:
+        return area, np.ones(len(motions), bool), np.ones(len(motions), bool)
+    off_m = np.array([_apart_m(expected.T_prev_cur, m.T_prev_cur) for m in motions])
+    noise_m = np.array([_NOISE * worst_translation_sigma_m(m) for m in motions])
+    within = off_m <= np.hypot(expected.reach_m, noise_m)
+    goes_on = within & (off_m == off_m.min())
+    if expected.T_refused is not None:  # what is nearer to it is the same thing's, however far a vehicle can have come
+        goes_on &= off_m <= [_apart_m(expected.T_refused, m.T_prev_cur) for m in motions]
+    odds, unseen = expected.odds, _UNSEEN
+    if expected.felt and (goes_on.any() or not within.any()):  # no part of the image speaks against an IMU
+        area, odds, unseen = np.zeros(len(motions)), odds + _REGAINED, 0.0
+    weight = area + odds * goes_on
+    if not goes_on.any():
+        weight = np.append(weight, weight.max() + odds + unseen)
+    return weight, goes_on, np.minimum(off_m, noise_m) <= expected.reach_m
+
+
+def _apart_m(first: Array, second: Array) -> float:
+    return float(np.linalg.norm((se3.inverse(first) @ second)[:3, 3]))
 
 
 def cells(uv: NDArray[np.floating[Any]], camera: StereoCamera) -> NDArray[np.int64]:

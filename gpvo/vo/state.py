@@ -12,12 +12,15 @@ from numpy.typing import NDArray
 
 from gpvo.errors import SourceError
 from gpvo.geometry import se3
-from gpvo.types import Array, StereoCamera, StereoFrame, TrackFrame
+from gpvo.types import Array, ImuMoments, StereoCamera, StereoFrame, TrackFrame
 from gpvo.vo.config import VoConfig
+from gpvo.vo.felt import Felt
 from gpvo.vo.frontend import Observation
-from gpvo.vo.rivals import Expected, Leaps
+from gpvo.vo.rivals import Choice, Expected, Leaps
 
 _GUESS_S = 0.5  # for so long a velocity is taken to last
+_SIGMAS_WITHIN_REACH = 5.0  # of what a vehicle can do
+_SUSPICION_NS = 10 * 10**9  # and a motion that was refused may come back
 
 
 @dataclass
@@ -35,15 +38,28 @@ class State:
     usual_inliers: float = 0.0
     rival: NDArray[np.bool_] | None = None  # the points of the last motion and of its rival, if there was one
     rivalry: float = 0.0  # running sum over the frames in which a second motion was seen
-    otherwise: Array = field(default_factory=lambda: np.zeros((6, 6)))  # covariance of having taken the wrong motion
+    in_doubt: Array = field(default_factory=lambda: np.zeros((6, 6)))  # covariance of having taken the wrong motion
     odds: float = 0.0  # log odds that the last velocity is that against the scene
     t_twist_ns: int | None = None  # when the velocity was last measured by a plausible motion
     leaps: Leaps = field(default_factory=lambda: Leaps(0))
+    refused: Array | None = None  # (6,) per second: the latest velocity that no vehicle could have reached
+    t_refused_ns: int = 0
+    felt: Felt | None = None  # None without an IMU in a known place
 
     @classmethod
-    def begin(cls, t_ns: int, points: int) -> State:
+    def begin(cls, t_ns: int, points: int, T_imu_cam: Array | None) -> State:
         """At rest, before any motion, with the frame at ``t_ns`` as reference."""
-        return cls(t_ns, t_ns, t_ns, np.eye(4), np.zeros(6), 0.0, points, leaps=Leaps(t_ns))
+        felt = None if T_imu_cam is None else Felt(T_imu_cam)
+        return cls(t_ns, t_ns, t_ns, np.eye(4), np.zeros(6), 0.0, points, leaps=Leaps(t_ns), felt=felt)
+
+    def feel(self, t_ns: int, imu: ImuMoments) -> None:
+        """Carry velocities on to the frame at ``t_ns``, over a step with these moments of the IMU."""
+        if self.felt is not None:
+            carry = self.felt.carry((t_ns - self.t_last_ns) * 1e-9, imu)
+            if self.leaps.before is not None:
+                self.leaps.before = np.concatenate([carry(self.leaps.before[:3]), self.leaps.before[3:]])
+            if self.refused is not None:
+                self.refused = np.concatenate([carry(self.refused[:3]), self.refused[3:]])
 
     def frozen(self, seen: Observation) -> str:
         """What repeats although the camera was moving; empty if nothing does."""
@@ -75,25 +91,73 @@ class State:
         """The motion to ``t_ns`` expected from the last velocity of the vehicle; None before there is one."""
         if self.t_twist_ns is None:
             return None
+        if t_ns - self.t_refused_ns > _SUSPICION_NS:
+            self.refused = None
         step_s, age_s = ((t_ns - since) * 1e-9 for since in (self.t_believed_ns, self.t_twist_ns))
-        return Expected(guess, max_acceleration_mps2 * age_s * step_s, self.odds)
+        T_refused = None if self.refused is None else self.T_ref_believed @ se3.exp(self.refused * step_s)
+        reach_mps = max_acceleration_mps2 * age_s
+        if self.felt is not None:
+            felt_mps = self.felt.reach_mps(suspicious=self.refused is not None)
+            if felt_mps < reach_mps:
+                twist = np.concatenate([self.felt.expected(self._lag_s), self.twist[3:]])
+                T, sigma_m = self.T_ref_believed @ se3.exp(twist * step_s), self.felt.sigma_mps() * step_s
+                return Expected(T, felt_mps * step_s, sigma_m, self.odds, T_refused, felt=True)
+        return Expected(guess, reach_mps * step_s, reach_mps * step_s / _SIGMAS_WITHIN_REACH, self.odds, T_refused)
+
+    def refuse(self, t_ns: int, T_ref_cur: Array) -> None:
+        """No vehicle made this motion from the reference."""
+        self.refused, self.t_refused_ns = self._velocity(t_ns, T_ref_cur), t_ns
+        if self.felt is not None:
+            self.felt.contradict((t_ns - self.t_last_ns) * 1e-9)
 
     def leap(self, t_ns: int, T_ref_cur: Array, max_acceleration_mps2: float) -> None:
         """The motion from the reference does not go on from the last velocity."""
         assert self.t_twist_ns is not None
-        now = self._velocity(t_ns, T_ref_cur)
-        self.leaps.step(t_ns, now, self.twist, self.t_twist_ns, max_acceleration_mps2)
+        now, last = self._velocity(t_ns, T_ref_cur), self.twist
+        if self.felt is not None and np.isfinite(self.felt.P[0, 0]):
+            last = np.concatenate([self.felt.expected(), last[3:]])
+        reach_mps = _SIGMAS_WITHIN_REACH * self._sigma_before_mps(t_ns, max_acceleration_mps2)
+        self.leaps.step(t_ns, now, last, self.t_twist_ns, reach_mps)
+        self.refused = None
+
+    def otherwise(self, t_ns: int, T_ref_cur: Array, max_acceleration_mps2: float) -> Array | None:
+        """Covariance (6, 6) of the motion from the reference while a velocity that was left may still be the scene's;
+        None where there is no doubt."""
+        before = self.leaps.doubted(t_ns)
+        if before is None:
+            return None
+        dt_s = (t_ns - self.t_ref_ns) * 1e-9
+        d = se3.log(se3.inverse(T_ref_cur) @ se3.exp(before * dt_s))
+        sigma_m = self._sigma_before_mps(t_ns, max_acceleration_mps2) * dt_s
+        return 0.5 * (np.outer(d, d) + np.diag([sigma_m**2] * 3 + [0.0] * 3))
+
+    def _sigma_before_mps(self, t_ns: int, max_acceleration_mps2: float) -> float:
+        """Standard deviation, on each axis, of the velocity before the leap, carried on to ``t_ns``."""
+        age_s = (t_ns - self.leaps.left_ns) * 1e-9
+        vehicle_mps = max_acceleration_mps2 * age_s / _SIGMAS_WITHIN_REACH
+        return vehicle_mps if self.felt is None else min(vehicle_mps, self.felt.sigma_mps(age_s))
+
+    @property
+    def _lag_s(self) -> float:
+        """How long before the middle of the latest step that of the time since the last believed motion was."""
+        return 0.5e-9 * (self.t_last_ns - self.t_believed_ns)
 
     def _velocity(self, t_ns: int, T_ref_cur: Array) -> Array:
         """(6,) per second, since the last believed motion."""
         step = se3.log(se3.inverse(self.T_ref_believed) @ T_ref_cur)
         return np.asarray(step / max((t_ns - self.t_believed_ns) * 1e-9, 1e-6))
 
-    def believe(self, t_ns: int, T_ref_cur: Array, parallax_px: float, inliers: int, *, tells: bool) -> None:
-        """Take over a measured motion from the reference; its velocity only where it ``tells``."""
+    def believe(
+        self, t_ns: int, T_ref_cur: Array, parallax_px: float, inliers: int, choice: Choice, sigma_m: float
+    ) -> None:
+        """Take over a measured motion from the reference; its velocity, to ``sigma_m``, only where it tells it."""
         self.usual_inliers = inliers if self.usual_inliers == 0 else 0.9 * self.usual_inliers + 0.1 * inliers
-        if tells:
+        if choice.tells:
             self.twist, self.t_twist_ns = self._velocity(t_ns, T_ref_cur), t_ns
+            if self.felt is not None:
+                sigma_mps = sigma_m / max((t_ns - self.t_believed_ns) * 1e-9, 1e-6)
+                leapt = not choice.goes_on or self.leaps.before is not None
+                self.felt.see(self.twist, sigma_mps, self._lag_s, leapt=leapt)
         self.parallax_px = abs(parallax_px - self.parallax_from_reference_px)
         self.parallax_from_reference_px = parallax_px
         self.T_ref_believed = T_ref_cur

@@ -21,7 +21,7 @@ def moving(z_m: float, sigma_m: float = 0.003) -> Motion:
 
 
 def expecting(z_m: float, odds: float) -> Expected:
-    return Expected(moving(z_m).T_prev_cur, 0.1, odds)
+    return Expected(moving(z_m).T_prev_cur, 0.1, 0.02, odds)
 
 
 def test_what_goes_on_is_taken_against_a_larger_rival_and_its_covariance_reaches_the_rival():
@@ -56,12 +56,12 @@ def test_a_leap_is_in_doubt_until_one_leads_back_or_it_has_lasted_as_long():
     seconds, before, lorry = 10**9, np.array([0, 0, 15.0, 0, 0, 0]), np.array([0, 0, 0.5, 0, 0, 0])
     leaps = Leaps(began_ns=0)
     assert leaps.doubted(8 * seconds) is None
-    leaps.step(8 * seconds, lorry, before, 79 * seconds // 10, 12.0)
+    leaps.step(8 * seconds, lorry, before, 79 * seconds // 10, 1.2)
     assert leaps.doubted(15 * seconds) is before
-    leaps.step(15 * seconds, before + 4.0, lorry, 149 * seconds // 10, 12.0)
+    leaps.step(15 * seconds, before + 4.0, lorry, 149 * seconds // 10, 12.0 * 7.1)
     assert leaps.doubted(15 * seconds) is None
     leaps = Leaps(began_ns=0)
-    leaps.step(8 * seconds, lorry, before, 8 * seconds, 12.0)
+    leaps.step(8 * seconds, lorry, before, 8 * seconds, 0.0)
     leaps.step(9 * seconds, before + 40.0, lorry, 9 * seconds, 12.0)  # no car has come there
     assert leaps.doubted(15 * seconds) is before
     assert leaps.doubted(17 * seconds) is None
@@ -75,9 +75,40 @@ def test_alone_and_as_expected_it_is_sure_of_itself():
     assert not choose([moving(2.0)], (1,), None).otherwise.any()
 
 
+def test_a_refused_motion_is_the_same_thing_s_however_far_the_vehicle_may_have_come():
+    after_a_second = Expected(moving(2.0).T_prev_cur, 5.0, 1.0, 3.0, T_refused=moving(0.1).T_prev_cur)
+    assert not choose([moving(0.0)], (1,), after_a_second).goes_on
+    assert choose([moving(1.2)], (1,), after_a_second).goes_on
+    assert choose([moving(0.0)], (1,), Expected(moving(2.0).T_prev_cur, 5.0, 1.0, 3.0)).goes_on
+
+
+def test_what_an_imu_felt_is_not_outvoted_by_the_image():
+    odds = 0.2
+    for _ in range(50):
+        choice = choose(
+            [moving(0.0), moving(2.0)], (60, 2), Expected(moving(2.05).T_prev_cur, 0.1, 0.02, odds, felt=True)
+        )
+        assert (choice.index, choice.plausible, choice.goes_on) == (1, True, True)
+        odds = choice.odds
+    assert odds == 3.0
+    for _ in range(50):
+        choice = choose([moving(0.0)], (1,), Expected(moving(2.05).T_prev_cur, 0.1, 0.02, odds, felt=True))
+        assert not choice.plausible
+        odds = choice.odds
+
+
+def test_the_unseen_motion_is_only_as_sure_as_what_it_was_expected_from():
+    for sigma_m in (0.1, 1.0):
+        choice = choose([moving(0.0)], (1,), Expected(moving(2.0).T_prev_cur, 0.5, sigma_m, 3.0))
+        assert np.sqrt(choice.otherwise[0, 0]) == pytest.approx(sigma_m, rel=0.1)
+
+
+@pytest.mark.parametrize("with_imu", [True, False], ids=["with an IMU", "without"])
 @pytest.mark.parametrize("seed", [0, 1])
-def test_traffic_is_never_called_ok_and_is_covered(tmp_path, seed):
+def test_traffic_is_never_called_ok_and_is_covered(tmp_path, seed, with_imu):
     source = open_source(simulate_points("street-traffic", seed, duration_s=25.0, cars=3).save(tmp_path / "a.npz"))
+    if not with_imu:
+        source.imu = None
     log = VoLog([step.record for step in steps(source, make_config())], source.camera)
     errors = motion_errors(log, source.truth)
     wrong_m = np.linalg.norm(errors.xi[:, :3], axis=1)
@@ -86,5 +117,5 @@ def test_traffic_is_never_called_ok_and_is_covered(tmp_path, seed):
     sigma_m = np.array([np.sqrt(np.trace(r.covariances["pointing_matching"][:3, :3])) for r in records])
     locked = wrong_m > 0.3
     assert ok.sum() > 50
-    assert (locked & ok).sum() <= 0.005 * ok.sum()
+    assert (locked & ok).sum() <= (0.0 if with_imu else 0.005) * ok.sum()
     assert (locked & (wrong_m > 6 * sigma_m)).sum() <= 0.05 * locked.sum()

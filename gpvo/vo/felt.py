@@ -1,0 +1,124 @@
+"""The last velocity, carried on by what an IMU felt: how fast the vehicle must be, whatever the image shows."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from gpvo.geometry import se3
+from gpvo.types import MOST_MPS2, MOST_RADPS, Array, ImuMoments
+
+_FORCE_MPS2 = 0.1  # error of the mean specific force, besides its noise: scale, alignment, the clock
+_WALK_MPS2 = 0.03  # per root second: what is left of a gyro's bias turns gravity away
+_MARGIN_MPS2 = 1.0  # that no IMU is believed beyond: its axes and its clock are never quite as stated
+_OTHERWISE_RADPS = 0.2  # no car beside the vehicle turns by as much
+_MOST_BIAS_RADPS = 0.02  # that a motion may teach at once
+_UNKNOWN_MPS2 = 10.0  # gravity, before anything is known of its direction
+_PATIENCE_S = 10.0  # of contradiction, until its variance is taken to be e times as large
+_UNPROVEN = 100.0  # times P, until the vehicle has accelerated as the IMU says
+_DISTRUSTED = 1e6  # times P: of no use
+_MEMORY = 0.05  # share of a motion, at 1 m/s^2 and more, in what is known of the filter's own error
+_BIAS_MEMORY = 0.05  # and of the gyro's bias
+
+
+@dataclass
+class Felt:
+    """A Kalman filter of the IMU's velocity and of the reaction to gravity, the accelerometer's bias in it, both (3,)
+    in camera axes.
+
+    No axis is known better than another: ``P`` (2, 2) is the covariance of the two on each. ``T_imu_cam`` (4, 4).
+    """
+
+    T_imu_cam: Array
+    velocity_mps: Array = field(default_factory=lambda: np.zeros(3))
+    reaction_mps2: Array = field(default_factory=lambda: np.zeros(3))
+    P: Array = field(default_factory=lambda: np.diag([np.inf, _UNKNOWN_MPS2**2]))
+    excess: float = _UNPROVEN  # of squared innovations over what P says, at least 1
+    age_s: float = 0.0  # since the velocity was measured
+    bias_radps: Array = field(default_factory=lambda: np.zeros(3))  # of the gyro, in camera axes
+    force_mps2: Array | None = None  # (3,) over the latest step
+    force_variance: float = 0.0  # of that force, as a mean of noisy samples
+    turn_radps: Array = field(default_factory=lambda: np.zeros(3))  # (3,) over the latest step
+    acceleration_mps2: Array = field(default_factory=lambda: np.zeros(3))  # (3,) over the latest step
+
+    def carry(self, dt_s: float, imu: ImuMoments) -> Callable[[Array], Array]:
+        """On by a step over which the IMU had these moments, from the middle of the step before; without samples that
+        can be, the velocity becomes unknown. What it does to any velocity (3,) of the camera in its axes."""
+        if not _can_be(imu):
+            self._forget()
+            return lambda velocity: velocity
+        self.age_s += dt_s
+        R_cam_imu, p_cam_imu = (T := se3.inverse(self.T_imu_cam))[:3, :3], T[:3, 3]
+        turn, force = R_cam_imu @ imu.mean[:3] - self.bias_radps, R_cam_imu @ imu.mean[3:]
+        R = se3.exp(np.concatenate([np.zeros(3), -turn * dt_s]))[:3, :3]
+        before = force if self.force_mps2 is None else R @ self.force_mps2
+        self.reaction_mps2 = R @ self.reaction_mps2
+        self.acceleration_mps2 = 0.5 * (force + before) - self.reaction_mps2
+        change = self.acceleration_mps2 * dt_s
+        of_lever = np.cross(turn, p_cam_imu) - R @ np.cross(self.turn_radps, p_cam_imu)
+        self.velocity_mps = R @ self.velocity_mps + change
+        self.force_mps2, self.turn_radps = force, turn
+        of_turn, of_force = imu.variance.reshape(2, 3).mean(axis=1) / imu.n
+        turned = of_turn * dt_s**2
+        pushed = (0.5 * (of_force + self.force_variance) + _FORCE_MPS2**2) * dt_s**2
+        self.force_variance = of_force
+        turns = turned * np.array([self.velocity_mps @ self.velocity_mps, self.reaction_mps2 @ self.reaction_mps2])
+        if np.isfinite(self.P[0, 0]):
+            F = np.array([[1.0, -dt_s], [0.0, 1.0]])
+            self.P = F @ self.P @ F.T
+        self.P = self.P + np.diag(turns + [pushed, _WALK_MPS2**2 * dt_s])
+        return lambda velocity: np.asarray(R @ velocity + change - of_lever)
+
+    def expected(self, lag_s: float = 0.0) -> Array:
+        """(3,) velocity of the camera in its axes, in the middle of the latest step or so long before."""
+        return np.asarray(self.velocity_mps - lag_s * self.acceleration_mps2 - self._of_lever())
+
+    def sigma_mps(self, age_s: float | None = None) -> float:
+        """Standard deviation of it on each axis; with an age, of another velocity that was carried on for so long."""
+        variance = self.P[0, 0] if age_s is None else self.P[1, 1] * age_s**2
+        return float(np.sqrt(self.excess * variance))
+
+    def reach_mps(self, *, suspicious: bool) -> float:
+        """By how much it may be wrong. While nothing else speaks against the image, no IMU is believed beyond a margin:
+        a velocity that leaps has to rouse suspicion first."""
+        return (3.0 if suspicious else 5.0) * self.sigma_mps() + (0.0 if suspicious else _MARGIN_MPS2 * self.age_s)
+
+    def see(self, twist: Array, sigma_mps: float, lag_s: float, *, leapt: bool) -> None:
+        """Odometry measured a velocity (6,) of the camera in its axes, so long before the middle of the latest step.
+        ``leapt``: it tells nothing of the IMU."""
+        if np.linalg.norm(self.turn_radps - twist[3:]) > _OTHERWISE_RADPS:  # axes, units or the clock are wrong
+            self._forget()
+        self.age_s, off_mps = 0.0, twist[:3] - self.expected(lag_s)
+        noise = sigma_mps**2 + 0.25 * lag_s**2 * float(self.acceleration_mps2 @ self.acceleration_mps2)
+        S = self.P[0, 0] + noise
+        if leapt or not np.isfinite(S):
+            self.velocity_mps, self.P = self.velocity_mps + off_mps, np.diag([noise, self.P[1, 1]])
+            return
+        share = _MEMORY * min(1.0, float(np.linalg.norm(self.acceleration_mps2)))
+        self.excess = max(1.0, self.excess + share * (float(off_mps @ off_mps) / (3 * S) - self.excess))
+        self.bias_radps = self.bias_radps + _BIAS_MEMORY * np.clip(
+            self.turn_radps - twist[3:], -_MOST_BIAS_RADPS, _MOST_BIAS_RADPS
+        )
+        gain = self.P[:, 0] / S
+        self.velocity_mps = self.velocity_mps + gain[0] * off_mps
+        self.reaction_mps2 = self.reaction_mps2 + gain[1] * off_mps
+        self.P = self.P - np.outer(gain, self.P[0])
+
+    def contradict(self, dt_s: float) -> None:
+        """For so long the image moved by a velocity out of reach: the IMU is trusted less, as it may be wrong."""
+        self.excess = min(self.excess * float(np.exp(dt_s / _PATIENCE_S)), _DISTRUSTED)
+
+    def _forget(self) -> None:
+        self.P, self.force_mps2 = np.diag([np.inf, _UNKNOWN_MPS2**2]), None
+
+    def _of_lever(self) -> Array:
+        """(3,) velocity of the IMU about the camera."""
+        return np.cross(self.turn_radps, se3.inverse(self.T_imu_cam)[:3, 3])
+
+
+def _can_be(imu: ImuMoments) -> bool:
+    """Whether a working IMU may have had these moments: in its range, and not one reading again and again."""
+    in_range = np.abs(imu.mean) < np.repeat([MOST_RADPS, MOST_MPS2], 3)
+    return imu.n > 0 and bool(in_range.all()) and (imu.n == 1 or bool(imu.variance.any()))
