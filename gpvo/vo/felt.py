@@ -16,10 +16,11 @@ _MARGIN_MPS2 = 1.0  # that no IMU is believed beyond: its axes and its clock are
 _OTHERWISE_RADPS = 0.2  # no car beside the vehicle turns by as much
 _MOST_BIAS_RADPS = 0.02  # that a motion may teach at once
 _UNKNOWN_MPS2 = 10.0  # gravity, before anything is known of its direction
+_KNOWN_MPS2 = 0.3  # and when enough is
 _PATIENCE_S = 10.0  # of contradiction, until its variance is taken to be e times as large
-_UNPROVEN = 100.0  # times P, until the vehicle has accelerated as the IMU says
+_UNPROVEN = (0.02, 0.02)  # squared errors of changes of velocity, and these squared [m^2/s^2], before any is seen
 _DISTRUSTED = 1e6  # times P: of no use
-_MEMORY = 0.05  # share of a motion, at 1 m/s^2 and more, in what is known of the filter's own error
+_MEMORY = 0.01  # share of a motion in what is known of the filter's own error
 _BIAS_MEMORY = 0.05  # and of the gyro's bias
 
 
@@ -35,8 +36,10 @@ class Felt:
     velocity_mps: Array = field(default_factory=lambda: np.zeros(3))
     reaction_mps2: Array = field(default_factory=lambda: np.zeros(3))
     P: Array = field(default_factory=lambda: np.diag([np.inf, _UNKNOWN_MPS2**2]))
-    excess: float = _UNPROVEN  # of squared innovations over what P says, at least 1
+    excess: float = 1.0  # of squared innovations over what P says, at least 1
+    wrong: Array = field(default_factory=lambda: np.array(_UNPROVEN))  # running sums of the same
     age_s: float = 0.0  # since the velocity was measured
+    changed_mps: float = 0.0  # how far it has changed since
     bias_radps: Array = field(default_factory=lambda: np.zeros(3))  # of the gyro, in camera axes
     force_mps2: Array | None = None  # (3,) over the latest step
     force_variance: float = 0.0  # of that force, as a mean of noisy samples
@@ -57,6 +60,7 @@ class Felt:
         self.reaction_mps2 = R @ self.reaction_mps2
         self.acceleration_mps2 = 0.5 * (force + before) - self.reaction_mps2
         change = self.acceleration_mps2 * dt_s
+        self.changed_mps += float(np.linalg.norm(change))
         of_lever = np.cross(turn, p_cam_imu) - R @ np.cross(self.turn_radps, p_cam_imu)
         self.velocity_mps = R @ self.velocity_mps + change
         self.force_mps2, self.turn_radps = force, turn
@@ -83,21 +87,28 @@ class Felt:
     def reach_mps(self, *, suspicious: bool) -> float:
         """By how much it may be wrong. While nothing else speaks against the image, no IMU is believed beyond a margin:
         a velocity that leaps has to rouse suspicion first."""
-        return (3.0 if suspicious else 5.0) * self.sigma_mps() + (0.0 if suspicious else _MARGIN_MPS2 * self.age_s)
+        wrong_mps = np.sqrt(self.wrong[0] / self.wrong[1]) * self.changed_mps
+        if suspicious:
+            return float(3.0 * self.sigma_mps() + 5.0 * wrong_mps)
+        return float(5.0 * (self.sigma_mps() + wrong_mps) + _MARGIN_MPS2 * self.age_s)
 
     def see(self, twist: Array, sigma_mps: float, lag_s: float, *, leapt: bool) -> None:
         """Odometry measured a velocity (6,) of the camera in its axes, so long before the middle of the latest step.
         ``leapt``: it tells nothing of the IMU."""
         if np.linalg.norm(self.turn_radps - twist[3:]) > _OTHERWISE_RADPS:  # axes, units or the clock are wrong
             self._forget()
-        self.age_s, off_mps = 0.0, twist[:3] - self.expected(lag_s)
+        changed_mps, off_mps = self.changed_mps, twist[:3] - self.expected(lag_s)
+        self.age_s = self.changed_mps = 0.0
         noise = sigma_mps**2 + 0.25 * lag_s**2 * float(self.acceleration_mps2 @ self.acceleration_mps2)
         S = self.P[0, 0] + noise
         if leapt or not np.isfinite(S):
             self.velocity_mps, self.P = self.velocity_mps + off_mps, np.diag([noise, self.P[1, 1]])
             return
-        share = _MEMORY * min(1.0, float(np.linalg.norm(self.acceleration_mps2)))
-        self.excess = max(1.0, self.excess + share * (float(off_mps @ off_mps) / (3 * S) - self.excess))
+        off, changed = float(off_mps @ off_mps), changed_mps**2
+        telling = changed / (changed + S) if self.P[1, 1] < _KNOWN_MPS2**2 else 0.0
+        wrong = (1 - _MEMORY * telling) * self.wrong + telling * np.array([off - 3 * S, changed])
+        self.wrong = np.maximum(wrong, 0.0)
+        self.excess = max(1.0, self.excess + _MEMORY * telling * (off / (3 * S) - self.excess))
         self.bias_radps = self.bias_radps + _BIAS_MEMORY * np.clip(
             self.turn_radps - twist[3:], -_MOST_BIAS_RADPS, _MOST_BIAS_RADPS
         )
