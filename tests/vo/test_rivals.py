@@ -116,6 +116,6 @@ def test_traffic_is_never_called_ok_and_is_covered(tmp_path, seed, with_imu):
     ok = np.array([r.status is Status.OK for r in records])
     sigma_m = np.array([np.sqrt(np.trace(r.covariances["pointing_matching"][:3, :3])) for r in records])
     locked = wrong_m > 0.3
-    assert ok.sum() > 50
+    assert ok.sum() > (40 if with_imu else 50)  # nine of seed 1 are of a car that creeps, which an IMU tells
     assert (locked & ok).sum() <= (0.0 if with_imu else 0.005) * ok.sum()
     assert (locked & (wrong_m > 6 * sigma_m)).sum() <= 0.05 * locked.sum()
