@@ -8,11 +8,12 @@ import sys
 from typing import NoReturn
 
 from gpvo.cameras.imagesize import MAX_PIXELS
-from gpvo.parallel import after_first, ending_signals
 
 
 def _terminate(number: int, _frame: object) -> NoReturn:
     """End as by Ctrl-C: worker processes and temporary folders go too. A second signal ends the process at once."""
+    from gpvo.parallel import after_first
+
     signal.signal(number, after_first(number))
     sys.exit(128 + number)  # the exit code that shells know it by
 
@@ -29,6 +30,8 @@ def main() -> None:
         elif hasattr(getattr(sys, name), "reconfigure"):  # no file's name is beyond what ASCII, or Windows, can show
             getattr(sys, name).reconfigure(errors="backslashreplace")
     try:
+        from gpvo.parallel import ending_signals
+
         for number in ending_signals():
             signal.signal(number, _terminate)
         try:
@@ -44,6 +47,8 @@ def main() -> None:
         sys.exit(130)
     finally:  # all is written: a signal while Python winds down its worker processes would print a traceback
         signal.signal(signal.SIGINT, signal.SIG_IGN)
+        from gpvo.parallel import after_first, ending_signals  # anew where Ctrl-C came while it was loaded
+
         for number in ending_signals():
             if signal.getsignal(number) is _terminate:
                 signal.signal(number, after_first(number))

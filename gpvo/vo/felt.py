@@ -29,10 +29,10 @@ class Felt:
     """A Kalman filter of the IMU's velocity and of the reaction to gravity, the accelerometer's bias in it, both (3,)
     in camera axes.
 
-    No axis is known better than another: ``P`` (2, 2) is the covariance of the two on each. ``T_imu_cam`` (4, 4).
+    No axis is known better than another: ``P`` (2, 2) is the covariance of the two on each. ``T_cam_imu`` (4, 4).
     """
 
-    T_imu_cam: Array
+    T_cam_imu: Array
     velocity_mps: Array = field(default_factory=lambda: np.zeros(3))
     reaction_mps2: Array = field(default_factory=lambda: np.zeros(3))
     P: Array = field(default_factory=lambda: np.diag([np.inf, _UNKNOWN_MPS2**2]))
@@ -48,12 +48,12 @@ class Felt:
 
     def carry(self, dt_s: float, imu: ImuMoments) -> Callable[[Array], Array]:
         """On by a step over which the IMU had these moments, from the middle of the step before; without samples that
-        can be, the velocity becomes unknown. What it does to any velocity (3,) of the camera in its axes."""
+        can be, the velocity becomes unknown. What it does to any velocity (6,) of the camera in its axes."""
         if not _can_be(imu):
             self._forget()
-            return lambda velocity: velocity
+            return lambda twist: twist
         self.age_s += dt_s
-        R_cam_imu, p_cam_imu = (T := se3.inverse(self.T_imu_cam))[:3, :3], T[:3, 3]
+        R_cam_imu = self.T_cam_imu[:3, :3]
         turn, force = R_cam_imu @ imu.mean[:3] - self.bias_radps, R_cam_imu @ imu.mean[3:]
         R = se3.exp(np.concatenate([np.zeros(3), -turn * dt_s]))[:3, :3]
         before = force if self.force_mps2 is None else R @ self.force_mps2
@@ -61,19 +61,25 @@ class Felt:
         self.acceleration_mps2 = 0.5 * (force + before) - self.reaction_mps2
         change = self.acceleration_mps2 * dt_s
         self.changed_mps += float(np.linalg.norm(change))
-        of_lever = np.cross(turn, p_cam_imu) - R @ np.cross(self.turn_radps, p_cam_imu)
+        of_lever_before = R @ self._of_lever()
         self.velocity_mps = R @ self.velocity_mps + change
         self.force_mps2, self.turn_radps = force, turn
+        change_of_camera = change - (self._of_lever() - of_lever_before)
         of_turn, of_force = imu.variance.reshape(2, 3).mean(axis=1) / imu.n
         turned = of_turn * dt_s**2
         pushed = (0.5 * (of_force + self.force_variance) + _FORCE_MPS2**2) * dt_s**2
         self.force_variance = of_force
         turns = turned * np.array([self.velocity_mps @ self.velocity_mps, self.reaction_mps2 @ self.reaction_mps2])
-        if np.isfinite(self.P[0, 0]):
+        if self.is_known:
             F = np.array([[1.0, -dt_s], [0.0, 1.0]])
             self.P = F @ self.P @ F.T
         self.P = self.P + np.diag(turns + [pushed, _WALK_MPS2**2 * dt_s])
-        return lambda velocity: np.asarray(R @ velocity + change - of_lever)
+        return lambda twist: np.concatenate([R @ twist[:3] + change_of_camera, twist[3:]])
+
+    @property
+    def is_known(self) -> bool:
+        """Whether the velocity is."""
+        return bool(np.isfinite(self.P[0, 0]))
 
     def expected(self, lag_s: float = 0.0) -> Array:
         """(3,) velocity of the camera in its axes, in the middle of the latest step or so long before."""
@@ -101,7 +107,7 @@ class Felt:
         self.age_s = self.changed_mps = 0.0
         noise = sigma_mps**2 + 0.25 * lag_s**2 * float(self.acceleration_mps2 @ self.acceleration_mps2)
         S = self.P[0, 0] + noise
-        if leapt or not np.isfinite(S):
+        if leapt or not self.is_known:
             self.velocity_mps, self.P = self.velocity_mps + off_mps, np.diag([noise, self.P[1, 1]])
             return
         off, changed = float(off_mps @ off_mps), changed_mps**2
@@ -126,7 +132,7 @@ class Felt:
 
     def _of_lever(self) -> Array:
         """(3,) velocity of the IMU about the camera."""
-        return np.cross(self.turn_radps, se3.inverse(self.T_imu_cam)[:3, 3])
+        return np.cross(self.turn_radps, self.T_cam_imu[:3, 3])
 
 
 def _can_be(imu: ImuMoments) -> bool:

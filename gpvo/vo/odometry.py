@@ -35,7 +35,6 @@ from gpvo.vo.state import State, Stopwatch, own_frame
 from gpvo.vo.window import Window
 
 _RIVAL_STAYS = 0.85  # per frame
-_NO_VEHICLE = "no vehicle changes its velocity like this"
 
 
 class StereoOdometry:
@@ -203,7 +202,10 @@ class StereoOdometry:
         if not chosen.plausible:
             self._state.refuse(t_ns, motions[chosen.index].T_prev_cur)
             is_felt = expected is not None and expected.felt
-            doubts.append("the IMU felt no such change of velocity" if is_felt else _NO_VEHICLE)
+            reason = (
+                "the IMU felt no such change of velocity" if is_felt else "no vehicle changes its velocity like this"
+            )
+            doubts.append(reason)
         elif chosen.tells and not chosen.goes_on:
             self._state.leap(t_ns, motions[chosen.index].T_prev_cur, self.config.max_acceleration_mps2)
         left = self._state.otherwise(t_ns, motions[chosen.index].T_prev_cur, self.config.max_acceleration_mps2)

@@ -49,7 +49,7 @@ class State:
     @classmethod
     def begin(cls, t_ns: int, points: int, T_imu_cam: Array | None) -> State:
         """At rest, before any motion, with the frame at ``t_ns`` as reference."""
-        felt = None if T_imu_cam is None else Felt(T_imu_cam)
+        felt = None if T_imu_cam is None else Felt(se3.inverse(T_imu_cam))
         return cls(t_ns, t_ns, t_ns, np.eye(4), np.zeros(6), 0.0, points, leaps=Leaps(t_ns), felt=felt)
 
     def feel(self, t_ns: int, imu: ImuMoments) -> None:
@@ -57,9 +57,9 @@ class State:
         if self.felt is not None:
             carry = self.felt.carry((t_ns - self.t_last_ns) * 1e-9, imu)
             if self.leaps.before is not None:
-                self.leaps.before = np.concatenate([carry(self.leaps.before[:3]), self.leaps.before[3:]])
+                self.leaps.before = carry(self.leaps.before)
             if self.refused is not None:
-                self.refused = np.concatenate([carry(self.refused[:3]), self.refused[3:]])
+                self.refused = carry(self.refused)
 
     def frozen(self, seen: Observation) -> str:
         """What repeats although the camera was moving; empty if nothing does."""
@@ -114,7 +114,7 @@ class State:
         """The motion from the reference does not go on from the last velocity."""
         assert self.t_twist_ns is not None
         now, last = self._velocity(t_ns, T_ref_cur), self.twist
-        if self.felt is not None and np.isfinite(self.felt.P[0, 0]):
+        if self.felt is not None and self.felt.is_known:
             last = np.concatenate([self.felt.expected(), last[3:]])
         reach_mps = _SIGMAS_WITHIN_REACH * self._sigma_before_mps(t_ns, max_acceleration_mps2)
         self.leaps.step(t_ns, now, last, self.t_twist_ns, reach_mps)
