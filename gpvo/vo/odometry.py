@@ -208,9 +208,16 @@ class StereoOdometry:
             doubts.append(reason)
         elif chosen.tells and not chosen.goes_on:
             self._state.leap(t_ns, motions[chosen.index].T_prev_cur, self.config.max_acceleration_mps2)
+        elif chosen.tells:
+            self._state.compare(t_ns, motions[chosen.index].T_prev_cur)
         left = self._state.otherwise(t_ns, motions[chosen.index].T_prev_cur, self.config.max_acceleration_mps2)
         if left is not None:
-            doubts.append("the velocity leapt: what it was before may be the scene's")
+            felt = self._state.leaps.contradicted
+            doubts.append(
+                "the IMU felt otherwise than the velocity changed"
+                if felt
+                else "the velocity leapt: what it was before may be the scene's"
+            )
             chosen = replace(chosen, otherwise=chosen.otherwise + left)
         return motions[chosen.index], chosen
 

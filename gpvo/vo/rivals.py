@@ -39,7 +39,8 @@ _REGAINED = 0.3  # log odds, with each frame in which nothing speaks against the
 class Expected:
     """``T_prev_cur`` (4, 4) at the last velocity, off which a vehicle is by ``reach_m`` at most, and by ``sigma_m`` on
     each axis; ``odds``: log odds that this velocity is that against the scene, and not against something that moves in
-    it. ``T_refused`` (4, 4), at a velocity that the vehicle could not have."""
+    it. ``T_refused`` (4, 4), at a velocity that the vehicle could not have; ``T_left`` (4, 4), to ``left_reach_m``, at
+    one that was left though an IMU says that it lasts."""
 
     T_prev_cur: Array
     reach_m: float
@@ -47,6 +48,8 @@ class Expected:
     odds: float
     T_refused: Array | None = None
     felt: bool = False  # an IMU says so
+    T_left: Array | None = None
+    left_reach_m: float = 0.0
 
 
 @dataclass(frozen=True)
@@ -69,19 +72,21 @@ class Leaps:
 
     One of the two is not the scene's, and as long as the image holds one motion alone nothing tells which. So the
     later one is in doubt for as long as the earlier had lasted, or until a leap leads back to where the vehicle can
-    have come from the earlier one meanwhile.
+    have come from the earlier one meanwhile. Where an IMU felt otherwise than the later one changes, the doubt lasts
+    as long as any may. By what an IMU felt, a velocity may also be left slowly.
     """
 
     began_ns: int
     before: Array | None = None  # (6,) the velocity that was left
     left_ns: int = 0
     until_ns: int = 0
+    contradicted: bool = False  # by the IMU, since
 
     def step(self, t_ns: int, now: Array, last: Array, t_last_ns: int, reach_mps: float) -> None:
         """The velocity leapt to ``now`` (6,) at ``t_ns``, from ``last`` (6,) at ``t_last_ns``; a vehicle can be off the
         one that was left by ``reach_mps``."""
         if self.before is None:
-            self.before, self.left_ns = last, t_last_ns
+            self.before, self.left_ns, self.contradicted = last, t_last_ns, False
             self.until_ns = t_ns + min(t_last_ns - self.began_ns, _LONGEST_DOUBT_NS)
         elif np.linalg.norm((now - self.before)[:3]) <= reach_mps:
             self.before = None
@@ -89,7 +94,8 @@ class Leaps:
 
     def doubted(self, t_ns: int) -> Array | None:
         """(6,) the velocity that may still be the scene's at ``t_ns`` instead; None where the one seen is believed."""
-        if self.before is not None and t_ns > self.until_ns:
+        until_ns = self.began_ns + _LONGEST_DOUBT_NS if self.contradicted else self.until_ns
+        if self.before is not None and t_ns > until_ns:
             self.before = None
         return self.before
 
@@ -101,7 +107,7 @@ def choose(motions: Sequence[Motion], covered: Sequence[int], expected: Expected
     Moments of the mixture: ``sum p_i (d_i d_i^T + C_i)``, with d_i from the chosen motion to another, and C_i of what
     was expected alone.
     """
-    weight, goes_on, tells = _weigh(motions, covered, expected)
+    weight, goes_on, tells, back = _weigh(motions, covered, expected)
     candidates = [m.T_prev_cur for m in motions]
     if len(weight) > len(motions) and expected is not None:
         candidates.append(expected.T_prev_cur)
@@ -118,30 +124,45 @@ def choose(motions: Sequence[Motion], covered: Sequence[int], expected: Expected
     otherwise = np.einsum("i,ij,ik->jk", share, d, d)
     if len(candidates) > len(motions) and expected is not None:
         otherwise[:3, :3] += share[-1] * expected.sigma_m**2 * np.eye(3)
-    return Choice(best, otherwise, plausible, plausible and bool(tells[best]), min(odds, _SUREST), bool(goes_on[best]))
+    on = bool(goes_on[best] and not back[best])
+    return Choice(best, otherwise, plausible, plausible and bool(tells[best]), min(odds, _SUREST), on)
 
 
 def _weigh(
     motions: Sequence[Motion], covered: Sequence[int], expected: Expected | None
-) -> tuple[Array, NDArray[np.bool_], NDArray[np.bool_]]:
-    """Log odds of each motion, and of what was expected where none goes on; which goes on; which tell the velocity."""
+) -> tuple[Array, NDArray[np.bool_], NDArray[np.bool_], NDArray[np.bool_]]:
+    """Log odds of each motion, and of what was expected where none goes on; which goes on; which tell the velocity; and
+    which goes on from a velocity that was left."""
     # Half a cell for one that explains none better than the other does.
     area = _AREA * np.log(np.maximum(covered[: len(motions)], 0.5))
     if expected is None:
-        return area, np.ones(len(motions), bool), np.ones(len(motions), bool)
+        every = np.ones(len(motions), bool)
+        return area, every, every, ~every
     off_m = np.array([_apart_m(expected.T_prev_cur, m.T_prev_cur) for m in motions])
     noise_m = np.array([_NOISE * worst_translation_sigma_m(m) for m in motions])
     within = off_m <= np.hypot(expected.reach_m, noise_m)
     goes_on = within & (off_m == off_m.min())
     if expected.T_refused is not None:  # what is nearer to it is the same thing's, however far a vehicle can have come
         goes_on &= off_m <= [_apart_m(expected.T_refused, m.T_prev_cur) for m in motions]
+    back = _back(motions, expected, np.where(within, 0.0, off_m))
+    goes_on = back if back.any() else goes_on
     odds, unseen = expected.odds, _UNSEEN
     if expected.felt and (goes_on.any() or not within.any()):  # no part of the image speaks against an IMU
         area, odds, unseen = np.zeros(len(motions)), odds + _REGAINED, 0.0
     weight = area + odds * goes_on
     if not goes_on.any():
         weight = np.append(weight, weight.max() + odds + unseen)
-    return weight, goes_on, np.minimum(off_m, noise_m) <= expected.reach_m
+    return weight, goes_on, back | (np.minimum(off_m, noise_m) <= expected.reach_m), back
+
+
+def _back(motions: Sequence[Motion], expected: Expected, off_m: Array) -> NDArray[np.bool_]:
+    """(N,) which motion goes on from a velocity that was left, and is nearer to it than to the last one; off that, each
+    is by ``off_m`` (N,)."""
+    if expected.T_left is None:
+        return np.zeros(len(motions), bool)
+    off_left_m = np.array([_apart_m(expected.T_left, m.T_prev_cur) for m in motions])
+    nearer = (off_left_m <= expected.left_reach_m) & (off_left_m < off_m)
+    return nearer & (off_left_m == off_left_m.min(where=nearer, initial=np.inf))
 
 
 def _apart_m(first: Array, second: Array) -> float:

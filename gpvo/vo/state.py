@@ -96,13 +96,18 @@ class State:
         step_s, age_s = ((t_ns - since) * 1e-9 for since in (self.t_believed_ns, self.t_twist_ns))
         T_refused = None if self.refused is None else self.T_ref_believed @ se3.exp(self.refused * step_s)
         reach_mps = max_acceleration_mps2 * age_s
-        if self.felt is not None:
-            felt_mps = self.felt.reach_mps(suspicious=self.refused is not None)
-            if felt_mps < reach_mps:
-                twist = np.concatenate([self.felt.expected(self._lag_s), self.twist[3:]])
-                T, sigma_m = self.T_ref_believed @ se3.exp(twist * step_s), self.felt.sigma_mps() * step_s
-                return Expected(T, felt_mps * step_s, sigma_m, self.odds, T_refused, felt=True)
-        return Expected(guess, reach_mps * step_s, reach_mps * step_s / _SIGMAS_WITHIN_REACH, self.odds, T_refused)
+        sigma_m = reach_mps * step_s / _SIGMAS_WITHIN_REACH
+        expected = Expected(guess, reach_mps * step_s, sigma_m, self.odds, T_refused)
+        if self.leaps.before is not None and self.leaps.contradicted:
+            left_reach_m = _SIGMAS_WITHIN_REACH * self._sigma_before_mps(t_ns, max_acceleration_mps2) * step_s
+            T_left = self.T_ref_believed @ se3.exp(self.leaps.before * step_s)
+            expected = replace(expected, T_left=T_left, left_reach_m=left_reach_m)
+        felt_mps = np.inf if self.felt is None else self.felt.reach_mps(suspicious=self.refused is not None)
+        if self.felt is None or felt_mps >= reach_mps:
+            return expected
+        twist = np.concatenate([self.felt.expected(self._lag_s), self.twist[3:]])
+        T, sigma_m = self.T_ref_believed @ se3.exp(twist * step_s), self.felt.sigma_mps() * step_s
+        return replace(expected, T_prev_cur=T, reach_m=felt_mps * step_s, sigma_m=sigma_m, felt=True)
 
     def refuse(self, t_ns: int, T_ref_cur: Array) -> None:
         """No vehicle made this motion from the reference."""
@@ -113,12 +118,26 @@ class State:
     def leap(self, t_ns: int, T_ref_cur: Array, max_acceleration_mps2: float) -> None:
         """The motion from the reference does not go on from the last velocity."""
         assert self.t_twist_ns is not None
-        now, last = self._velocity(t_ns, T_ref_cur), self.twist
+        last = self.twist
         if self.felt is not None and self.felt.is_known:
             last = np.concatenate([self.felt.expected(), last[3:]])
         reach_mps = _SIGMAS_WITHIN_REACH * self._sigma_before_mps(t_ns, max_acceleration_mps2)
-        self.leaps.step(t_ns, now, last, self.t_twist_ns, reach_mps)
+        self.leaps.step(t_ns, self._velocity(t_ns, T_ref_cur), last, self.t_twist_ns, reach_mps)
         self.refused = None
+
+    def compare(self, t_ns: int, T_ref_cur: Array) -> None:
+        """The motion from the reference goes on from the last velocity; but if that has slowly become another than the
+        IMU felt, it is in doubt as after a leap."""
+        if self.felt is None:
+            return
+        now = self._velocity(t_ns, T_ref_cur)
+        alone_mps = self.felt.contradicted(now, self._lag_s)
+        if alone_mps is None or self.felt.span is None:
+            return
+        if self.leaps.before is None:
+            began_ns = t_ns - round(self.felt.span.age_s * 1e9)
+            self.leaps.step(t_ns, now, np.concatenate([alone_mps, now[3:]]), began_ns, 0.0)
+        self.leaps.contradicted = True
 
     def otherwise(self, t_ns: int, T_ref_cur: Array, max_acceleration_mps2: float) -> Array | None:
         """Covariance (6, 6) of the motion from the reference while a velocity that was left may still be the scene's;
@@ -156,8 +175,8 @@ class State:
             self.twist, self.t_twist_ns = self._velocity(t_ns, T_ref_cur), t_ns
             if self.felt is not None:
                 sigma_mps = sigma_m / max((t_ns - self.t_believed_ns) * 1e-9, 1e-6)
-                leapt = not choice.goes_on or self.leaps.before is not None
-                self.felt.see(self.twist, sigma_mps, self._lag_s, leapt=leapt)
+                doubted = self.leaps.before is not None
+                self.felt.see(self.twist, sigma_mps, self._lag_s, leapt=not choice.goes_on, doubted=doubted)
         self.parallax_px = abs(parallax_px - self.parallax_from_reference_px)
         self.parallax_from_reference_px = parallax_px
         self.T_ref_believed = T_ref_cur

@@ -90,6 +90,45 @@ def test_without_samples_that_can_be_nothing_is_known(imu):
     assert np.allclose(felt.expected(), 0.1)
 
 
+STEP_S, GRAVITY_MPS2 = 0.1, 9.80665
+
+
+def set_off(gravity_mps2: float = GRAVITY_MPS2) -> tuple[Felt, float]:
+    """Ten seconds at rest, then off at 2 m/s^2 along z while the image shows rest: the filter as soon as it contradicts
+    that, after three seconds at most, and how fast the vehicle is by then [m/s]."""
+    felt, mps = Felt(np.eye(4)), 0.0
+    for k in range(130):
+        push = 2.0 * (k >= 100)
+        mps += push * STEP_S
+        force = [0.0, -gravity_mps2, push]
+        felt.carry(STEP_S, ImuMoments(20, np.concatenate([np.zeros(3), force]), NOISE))
+        if felt.contradicted(np.zeros(6), 0.0) is not None:
+            break
+        felt.see(np.zeros(6), SIGMA_MPS, 0.0, leapt=False)
+    return felt, mps
+
+
+def test_an_image_that_stays_behind_is_contradicted_by_the_true_velocity():
+    felt, mps = set_off()
+    alone_mps = felt.contradicted(np.zeros(6), 0.0)
+    assert alone_mps is not None
+    assert mps < 4.0  # half of it might be felt wrongly, and a metre per second besides
+    assert np.allclose(alone_mps, [0.0, 0.0, mps], atol=0.5)
+
+
+def test_an_image_that_moves_as_much_as_was_felt_is_not():
+    """Whichever way: then the IMU's axes are another's."""
+    felt, mps = set_off()
+    for way in np.eye(6)[:3]:
+        assert felt.contradicted(mps * way, 0.0) is None
+        assert felt.contradicted(-mps * way, 0.0) is None
+
+
+def test_what_cannot_be_gravity_contradicts_nothing():
+    for gravity_mps2 in (0.0, 1.0, 1.62):
+        assert set_off(gravity_mps2)[0].contradicted(np.zeros(6), 0.0) is None
+
+
 FAULTS: dict[str, Callable[[ImuLog], ImuLog]] = {
     "upside down": lambda imu: replace(imu, acc_mps2=-imu.acc_mps2),
     "gyro in deg/s": lambda imu: replace(imu, gyro_radps=np.rad2deg(imu.gyro_radps)),

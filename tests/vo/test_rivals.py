@@ -103,6 +103,15 @@ def test_the_unseen_motion_is_only_as_sure_as_what_it_was_expected_from():
         assert np.sqrt(choice.otherwise[0, 0]) == pytest.approx(sigma_m, rel=0.1)
 
 
+def wrong_and_ok(log: VoLog, truth) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Of each motion with truth: its error [m], whether it is ``ok``, and its stated sigma [m], over all axes."""
+    errors = motion_errors(log, truth)
+    records = [log.records[i] for i in errors.index]
+    sigma_m = [np.sqrt(np.trace(r.covariances["pointing_matching"][:3, :3])) for r in records]
+    ok = [r.status is Status.OK for r in records]
+    return np.linalg.norm(errors.xi[:, :3], axis=1), np.array(ok), np.array(sigma_m)
+
+
 @pytest.mark.parametrize("with_imu", [True, False], ids=["with an IMU", "without"])
 @pytest.mark.parametrize("seed", [0, 1])
 def test_traffic_is_never_called_ok_and_is_covered(tmp_path, seed, with_imu):
@@ -110,12 +119,23 @@ def test_traffic_is_never_called_ok_and_is_covered(tmp_path, seed, with_imu):
     if not with_imu:
         source.imu = None
     log = VoLog([step.record for step in steps(source, make_config())], source.camera)
-    errors = motion_errors(log, source.truth)
-    wrong_m = np.linalg.norm(errors.xi[:, :3], axis=1)
-    records = [log.records[i] for i in errors.index]
-    ok = np.array([r.status is Status.OK for r in records])
-    sigma_m = np.array([np.sqrt(np.trace(r.covariances["pointing_matching"][:3, :3])) for r in records])
+    wrong_m, ok, sigma_m = wrong_and_ok(log, source.truth)
     locked = wrong_m > 0.3
     assert ok.sum() > (40 if with_imu else 50)  # nine of seed 1 are of a car that creeps, which an IMU tells
     assert (locked & ok).sum() <= (0.0 if with_imu else 0.005) * ok.sum()
     assert (locked & (wrong_m > 6 * sigma_m)).sum() <= 0.05 * locked.sum()
+
+
+@pytest.mark.parametrize("seed", [205, 220])
+def test_an_imu_tells_a_car_that_sets_off_with_the_vehicle(tmp_path, seed):
+    """The first acceleration that the IMU ever feels; the image follows the other car without a leap, or for longer
+    than the velocity before it had lasted."""
+    path = simulate_points("street-traffic", seed, duration_s=40.0).save(tmp_path / "a.npz")
+    source, config = open_source(path), make_config(max_acceleration_mps2=12.0, max_turn_radps2=20.0)
+    log = VoLog([step.record for step in steps(source, config)], source.camera)
+    wrong_m, ok, sigma_m = wrong_and_ok(log, source.truth)
+    locked = wrong_m > 0.3
+    assert ok.sum() > 50
+    assert locked.sum() > 20
+    assert not (locked & ok).any()
+    assert (locked & (wrong_m > 6 * sigma_m)).sum() <= 0.15 * locked.sum()
