@@ -61,3 +61,11 @@ def test_its_small_version_is_a_test(title: str) -> None:
     path, name = field(MEASURED[title], "Small version").split("::")
     tree = ast.parse((ROOT / path).read_text())
     assert name in {node.name for node in tree.body if isinstance(node, ast.FunctionDef)}
+
+
+def test_the_paper_states_the_same_figures() -> None:
+    paper = (ROOT / "docs" / "paper.md").read_text()
+    (measured,) = re.findall(r"^# What was measured\n(.+?)^# ", paper, flags=re.MULTILINE | re.DOTALL)
+    stated = re.findall(r"-?\d+\.\d+", measured)
+    assert len(stated) >= 5
+    assert set(stated) <= set(re.findall(r"-?\d+\.\d+", PAGE))
