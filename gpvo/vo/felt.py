@@ -48,7 +48,7 @@ class _Span:
         self.age_s += dt_s
 
     def confirms(self, velocity_mps: Array) -> bool:
-        """Whether the IMU alone came to the same velocity (3,)."""
+        """Whether the IMU alone came to the same velocity (3,), within what a good one errs."""
         off_mps, changed_mps = (np.linalg.norm(v) for v in (velocity_mps - self.velocity_mps, self.changed_mps))
         return bool(off_mps < 2.0 * self._sigma_mps() + 0.1 * changed_mps + 0.1)
 
@@ -79,8 +79,8 @@ class Felt:
     P: Array = field(default_factory=lambda: np.diag([np.inf, _UNKNOWN_MPS2**2]))
     excess: float = 1.0  # of squared innovations over what P says, at least 1
     wrong: Array = field(default_factory=lambda: np.array(_UNPROVEN))  # running sums of the same
-    span: _Span | None = None
-    span_wrong: Array = field(default_factory=lambda: np.array(_SPAN_UNPROVEN))
+    span: _Span | None = None  # since odometry last agreed
+    span_wrong: Array = field(default_factory=lambda: np.array(_SPAN_UNPROVEN))  # sums as in wrong, over spans
     age_s: float = 0.0  # since the velocity was measured
     changed_mps: float = 0.0  # how far it has changed since
     bias_radps: Array = field(default_factory=lambda: np.zeros(3))  # of the gyro, in camera axes
@@ -101,14 +101,15 @@ class Felt:
         R = se3.exp(np.concatenate([np.zeros(3), -turn * dt_s]))[:3, :3]
         before = force if self.force_mps2 is None else R @ self.force_mps2
         self.reaction_mps2 = R @ self.reaction_mps2
-        self.acceleration_mps2 = 0.5 * (force + before) - self.reaction_mps2
+        over_step = 0.5 * (force + before)
+        self.acceleration_mps2 = over_step - self.reaction_mps2
         change = self.acceleration_mps2 * dt_s
         self.changed_mps += float(np.linalg.norm(change))
         of_lever_before = R @ self._of_lever()
         self.velocity_mps = R @ self.velocity_mps + change
         self.force_mps2, self.turn_radps = force, turn
         if self.span is not None:
-            self.span.carry(R, 0.5 * (force + before), dt_s)
+            self.span.carry(R, over_step, dt_s)
         change_of_camera = change - (self._of_lever() - of_lever_before)
         of_turn, of_force = imu.variance.reshape(2, 3).mean(axis=1) / imu.n
         turned = of_turn * dt_s**2

@@ -199,25 +199,21 @@ class StereoOdometry:
         if len(motions) == 1 and chosen.plausible:  # a rival that is not found in one frame has not gone
             chosen = replace(chosen, otherwise=_RIVAL_STAYS * self._state.in_doubt)
         self._state.odds, self._state.in_doubt = chosen.odds, chosen.otherwise
+        T_ref_cur = motions[chosen.index].T_prev_cur
         if not chosen.plausible:
-            self._state.refuse(t_ns, motions[chosen.index].T_prev_cur)
+            self._state.refuse(t_ns, T_ref_cur)
             is_felt = expected is not None and expected.felt
             reason = (
                 "the IMU felt no such change of velocity" if is_felt else "no vehicle changes its velocity like this"
             )
             doubts.append(reason)
         elif chosen.tells and not chosen.goes_on:
-            self._state.leap(t_ns, motions[chosen.index].T_prev_cur, self.config.max_acceleration_mps2)
+            self._state.leap(t_ns, T_ref_cur, self.config.max_acceleration_mps2)
         elif chosen.tells:
-            self._state.compare(t_ns, motions[chosen.index].T_prev_cur)
-        left = self._state.otherwise(t_ns, motions[chosen.index].T_prev_cur, self.config.max_acceleration_mps2)
+            self._state.compare(t_ns, T_ref_cur)
+        left = self._state.otherwise(t_ns, T_ref_cur, self.config.max_acceleration_mps2)
         if left is not None:
-            felt = self._state.leaps.contradicted
-            doubts.append(
-                "the IMU felt otherwise than the velocity changed"
-                if felt
-                else "the velocity leapt: what it was before may be the scene's"
-            )
+            doubts.append(self._state.leaps.reason)
             chosen = replace(chosen, otherwise=chosen.otherwise + left)
         return motions[chosen.index], chosen
 

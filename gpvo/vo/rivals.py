@@ -92,6 +92,13 @@ class Leaps:
             self.before = None
         self.began_ns = t_ns
 
+    @property
+    def reason(self) -> str:
+        """Of the doubt, in words."""
+        if self.contradicted:
+            return "the IMU felt otherwise than the velocity changed"
+        return "the velocity leapt: what it was before may be the scene's"
+
     def doubted(self, t_ns: int) -> Array | None:
         """(6,) the velocity that may still be the scene's at ``t_ns`` instead; None where the one seen is believed."""
         until_ns = self.began_ns + _LONGEST_DOUBT_NS if self.contradicted else self.until_ns

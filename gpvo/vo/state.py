@@ -128,11 +128,11 @@ class State:
     def compare(self, t_ns: int, T_ref_cur: Array) -> None:
         """The motion from the reference goes on from the last velocity; but if that has slowly become another than the
         IMU felt, it is in doubt as after a leap."""
-        if self.felt is None:
+        if self.felt is None or self.felt.span is None:
             return
         now = self._velocity(t_ns, T_ref_cur)
         alone_mps = self.felt.contradicted(now, self._lag_s)
-        if alone_mps is None or self.felt.span is None:
+        if alone_mps is None:
             return
         if self.leaps.before is None:
             began_ns = t_ns - round(self.felt.span.age_s * 1e9)

@@ -9,7 +9,7 @@ from gpvo.geometry import se3
 from gpvo.io import open_source
 from gpvo.runner import steps
 from gpvo.sim.points import simulate_points
-from gpvo.types import ImuLog, ImuMoments, Status
+from gpvo.types import STANDARD_GRAVITY_MPS2, ImuLog, ImuMoments, Status
 from gpvo.vo.config import make_config
 from gpvo.vo.felt import Felt
 
@@ -90,10 +90,10 @@ def test_without_samples_that_can_be_nothing_is_known(imu):
     assert np.allclose(felt.expected(), 0.1)
 
 
-STEP_S, GRAVITY_MPS2 = 0.1, 9.80665
+STEP_S = 0.1
 
 
-def set_off(gravity_mps2: float = GRAVITY_MPS2) -> tuple[Felt, float]:
+def set_off(gravity_mps2: float = STANDARD_GRAVITY_MPS2) -> tuple[Felt, float]:
     """Ten seconds at rest, then off at 2 m/s^2 along z while the image shows rest: the filter as soon as it contradicts
     that, after three seconds at most, and how fast the vehicle is by then [m/s]."""
     felt, mps = Felt(np.eye(4)), 0.0
