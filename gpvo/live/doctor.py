@@ -11,24 +11,27 @@ from __future__ import annotations
 import threading
 import time
 from collections import Counter
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from gpvo.errors import GpvoError, SourceError, counted
+from gpvo.errors import GpvoError, SourceError, counted, printable
 from gpvo.geometry import se3
-from gpvo.geometry.covariance import are_covariances, variances
-from gpvo.io.bag_reader import POSE_TYPES, is_bag, messages, open_bag, topics_of
+from gpvo.geometry.covariance import LARGEST, are_covariances, variances
+from gpvo.io.bag_messages import covariances_of, pose_of
+from gpvo.io.bag_reader import POSE_TYPES, is_bag, messages, open_bag, stamp_ns, topics_of
+from gpvo.io.trajectory import FARTHEST_M
 from gpvo.live import WIRES
 from gpvo.live.intake import Mailbox, arrivals
 from gpvo.live.job import open_wire
 from gpvo.live.outputs import decode
-from gpvo.live.stated import ENOUGH, Finding, Stated
 from gpvo.types import Array
 
+_ENOUGH = 10  # messages that there must be to judge
 _LEAST, _MOST = 0.02, 300.0  # jitter of frames cancels in the pose; a bias adds up over as many frames as it lasts
 _SWAPPED = "every consumer reads metres where there are radians, and vice versa"
 _UNLIKE = 0.7  # of the motion over a second
@@ -38,6 +41,68 @@ _RL_FLOOR = "robot_localization uses 1e-9, a sigma of 0.03 mm, and ignores every
 _PX4_FLOOR = "PX4 uses EKF2_EVP_NOISE, EKF2_EVV_NOISE and EKF2_EVA_NOISE (0.1) instead"
 _AP_FLOOR = "ArduPilot uses VISO_POS_M_NSE (0.2 m) and VISO_YAW_M_NSE (0.2 rad)"
 _DEPTH = 10_000  # messages of a live topic that may wait
+
+
+@dataclass(frozen=True)
+class Finding:
+    """One thing that is wrong: ``code`` for scripts, what was seen, and what each consumer makes of it."""
+
+    code: str
+    what: str
+    consequence: str
+    share: float = 1.0
+
+    @classmethod
+    def where(cls, bad: Any, code: str, what: str, consequence: str) -> Iterator[Finding]:
+        """Of the messages that are ``bad`` (N,); none where none is."""
+        if bad.any():
+            yield cls(code, what, consequence, float(bad.mean()))
+
+    def __str__(self) -> str:
+        part = "" if self.share >= 1.0 else f" ({100 * self.share:.0f} % of the messages)"
+        return f"{self.code}: {self.what}{part}\n    {self.consequence}"
+
+
+@dataclass(frozen=True)
+class Stated:
+    """A recording of one topic. ``T`` (N, 4, 4); ``pose``, ``twist`` (N, 6, 6) or None where the type has none; ``v``
+    (N, 6) the twist, None likewise; ``quaternion_norm`` (N,); ``frames``: the pairs of frame names that occur.
+    """
+
+    t_ns: np.ndarray
+    T: Array
+    quaternion_norm: Array
+    frames: tuple[tuple[str, str], ...]
+    pose: Array | None
+    twist: Array | None
+    v: Array | None
+
+    @classmethod
+    def of(cls, messages: Iterable[Any], where: object = None) -> Stated:
+        """From messages of a bag ``where``, in the order of their arrival. GpvoError where there are fewer than ten."""
+        kept = list(messages)
+        if len(kept) < _ENOUGH:
+            what = f"{counted(len(kept), 'message')}: too few to judge"
+            raise GpvoError(what, where=where, cure=f"record at least {_ENOUGH}")
+        rows = np.array([pose_of(m) for m in kept])
+        norm = np.linalg.norm(rows[:, 3:], axis=1)
+        near = np.abs(rows[:, :3]).max(axis=1) < FARTHEST_M  # false for NaN
+        good = near & np.isfinite(rows).all(axis=1) & (norm > 1e-6)
+        T = np.tile(np.full((4, 4), np.nan), (len(rows), 1, 1))
+        T[good] = se3.from_quaternion(rows[good, :3], rows[good, 3:] / norm[good, None])
+        pairs = ((m.header.frame_id, getattr(m, "child_frame_id", "-")) for m in kept)
+        frames = dict.fromkeys((printable(parent), printable(child)) for parent, child in pairs)
+        v = [_twist(m) for m in kept] if hasattr(kept[0], "twist") else None
+        # What is beyond all measure is as good as infinite, and squares of the rest stay finite.
+        stated = (covariances_of(kept, name) for name in ("pose", "twist"))
+        pose, twist = (None if C is None else np.where(np.abs(C) >= LARGEST, np.inf, C) for C in stated)
+        t_ns = np.array([stamp_ns(m) for m in kept], dtype=np.int64)
+        return cls(t_ns, T, norm, tuple(frames), pose, twist, None if v is None else np.array(v))
+
+
+def _twist(message: Any) -> list[float]:
+    a, b = message.twist.twist.linear, message.twist.twist.angular
+    return [a.x, a.y, a.z, b.x, b.y, b.z]
 
 
 def examine_bag(path: Path, topic: str | None = None) -> dict[str, list[Finding]]:
@@ -182,7 +247,7 @@ def _motions(s: Stated) -> tuple[NDArray[np.intp], Array, Array] | None:
     dt = np.diff(s.t_ns) * 1e-9
     whole = np.asarray(np.isfinite(s.T).all(axis=(1, 2)))
     (start,) = np.nonzero((dt > 0) & whole[1:] & whole[:-1])
-    if len(start) < ENOUGH:
+    if len(start) < _ENOUGH:
         return None
     return start + 1, se3.log(se3.inverse(s.T[start]) @ s.T[start + 1]), dt[start]
 
@@ -282,7 +347,7 @@ def _turned(name: str, C: Array, R: Array) -> Iterator[Finding]:
     off = C[:, ~np.eye(6, dtype=bool)]
     d = variances(C)[:, :3]
     good = np.isfinite(R).all(axis=(1, 2))
-    if off.any() or good.sum() < ENOUGH or np.ptp(np.abs(d), axis=0).max() < 1e-2 * np.abs(d).max():
+    if off.any() or good.sum() < _ENOUGH or np.ptp(np.abs(d), axis=0).max() < 1e-2 * np.abs(d).max():
         return
     for turn in (R, np.swapaxes(R, 1, 2)):
         back = np.einsum("nij,nj->ni", turn[good], d[good])

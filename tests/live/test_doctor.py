@@ -15,8 +15,7 @@ from gpvo.errors import GpvoError
 from gpvo.geometry import se3
 from gpvo.io.foreign import T_FLU_OPTICAL
 from gpvo.io.trajectory import write_tum
-from gpvo.live.doctor import examine, examine_bag
-from gpvo.live.stated import Stated
+from gpvo.live.doctor import Stated, examine, examine_bag
 from gpvo.publish.odometry import Odometry
 from gpvo.publish.ros import odometry_message
 from shim_bags import engine, flight, flown
