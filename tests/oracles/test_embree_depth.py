@@ -27,7 +27,7 @@ OPTICAL = np.array([[0, 0, 1, 0], [-1, 0, 0, 0], [0, -1, 0, 0], [0, 0, 0, 1.0]])
 def world() -> World:
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr("gpvo.sim.worlds.tunnel._TEXTURE_PX", 1024)
-        return tunnel.build(3, length=40.0)
+        return tunnel.build(3, tunnel.Params(length=40.0))
 
 
 def embree_depth(world: World, model: CameraModel, T_world_cam: np.ndarray) -> np.ndarray:

@@ -102,8 +102,8 @@ def test_seeds_differ() -> None:
 
 
 def test_branches_open_into_the_main_tunnel() -> None:
-    world = tunnel.build(2, length=40.0, curve="branching", step=0.25, lamps=0)
-    whole = tunnel.build(2, length=40.0, curve="curved", step=0.25, lamps=0)
+    world = tunnel.build(2, tunnel.Params(length=40.0, curve="branching", step=0.25, lamps=0))
+    whole = tunnel.build(2, tunnel.Params(length=40.0, curve="curved", step=0.25, lamps=0))
     assert len(world.mesh.faces) > len(whole.mesh.faces)
     assert world.clearance(world.centreline).min() > 0.8
 

@@ -6,12 +6,11 @@ A world is one textured, baked mesh and what paths and vehicles need to know abo
 from __future__ import annotations
 
 import hashlib
-import inspect
 import json
 import os
 import zipfile
 from contextlib import suppress
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from functools import cached_property
 from importlib import import_module
 from pathlib import Path
@@ -24,7 +23,7 @@ from scipy.spatial import cKDTree
 from gpvo.errors import GpvoError, SourceError
 from gpvo.files import replacing
 from gpvo.io.snapshot import code_digest
-from gpvo.types import Array
+from gpvo.types import Array, field_names, out_of_limits
 
 F32 = NDArray[np.float32]
 KINDS = ("tunnel", "lunar", "room")
@@ -32,13 +31,6 @@ _NEIGHBOURS = 16
 _CHUNK = 4096
 _LARGEST_BYTES = 2_000_000_000
 _ARRAYS = ("centreline", "start_pose", "bounds")
-
-
-def check_ranges(**given: tuple[float, float, float]) -> None:
-    """Refuse parameters, given as (value, least, most), that are out of range. Raises GpvoError."""
-    for name, (value, low, high) in given.items():
-        if not low <= value <= high:
-            raise GpvoError(f"{name} = {value} is not between {low} and {high}")
 
 
 @dataclass(frozen=True)
@@ -215,30 +207,29 @@ def _closest_on_triangles(p: Array, a: Array, b: Array, c: Array) -> Array:
     return a + v[..., None] * ab + w[..., None] * ac
 
 
-def world_parameters(kind: str) -> dict[str, object]:
-    """Names and defaults of the parameters that ``build_world`` takes for a kind."""
-    if kind not in KINDS:
-        raise GpvoError(f"unknown world '{kind}'", cure=f"choose from {', '.join(KINDS)}")
-    signature = inspect.signature(import_module(f"gpvo.sim.worlds.{kind}").build)
-    return {name: p.default for name, p in signature.parameters.items() if name != "seed"}
-
-
 def build_world(kind: str, seed: int, **params: object) -> World:
     """The world of a kind (``tunnel``, ``lunar``, ``room``) and a seed; the second time it comes from the cache.
+
+    ``params``: single values of ``Params`` in the kind's module.
 
     The cache lies in ``$XDG_CACHE_HOME/gpvo``; it may be deleted at any time. Raises GpvoError for an unknown kind or
     parameter, or a value a world cannot be built with; MissingExtraError where Embree or numba are not installed (extra
     ``gpvo[sim]``).
     """
-    known = world_parameters(kind)
+    if kind not in KINDS:
+        raise GpvoError(f"unknown world '{kind}'", cure=f"choose from {', '.join(KINDS)}")
+    module = import_module(f"gpvo.sim.worlds.{kind}")
+    known = field_names(module.Params)
     if unknown := sorted(set(params) - set(known)):
         raise GpvoError(f"the world '{kind}' has no parameter '{unknown[0]}'", cure=f"it has {', '.join(known)}")
-    full = {**known, **params}
-    text = json.dumps([kind, int(seed), full, code_digest(Path(__file__).parent)], sort_keys=True, default=str)
+    full = module.Params(**params)
+    for name, value, low, high in out_of_limits(full):
+        raise GpvoError(f"{name} = {value} is not between {low} and {high}")
+    text = json.dumps([kind, int(seed), asdict(full), code_digest(Path(__file__).parent)], sort_keys=True, default=str)
     path = cache_folder() / f"{kind}-{seed}-{hashlib.sha256(text.encode()).hexdigest()[:16]}.npz"
     with suppress(OSError, ValueError, KeyError, TypeError, zipfile.BadZipFile):  # absent or damaged: built anew
         return load_world(path)
-    world: World = import_module(f"gpvo.sim.worlds.{kind}").build(seed, **full)
+    world: World = module.build(seed, full)
     with suppress(OSError, SourceError):  # a full or read-only home costs time at the next run, nothing else
         _save_world(world, path)
     return world

@@ -4,16 +4,17 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
 from scipy.ndimage import map_coordinates
 
-from gpvo.sim.worlds import HeightGrid, Lighting, LightMap, Mesh, World, check_ranges
+from gpvo.sim.worlds import HeightGrid, Lighting, LightMap, Mesh, World
 from gpvo.sim.worlds.shapes import Baker, Parts, add_stone, grid_faces, icosphere
 from gpvo.sim.worlds.textures import fractal, lattice, regolith, rock, spectral
-from gpvo.types import Array
+from gpvo.types import Array, within
 
 _TILE_M = 2.5
 _TEXTURE_PX = 2048
@@ -28,33 +29,30 @@ _SHADOW_WIDTH_M = 9.0  # half the width of the strip with sharp shadows
 _GROUND, _ROCK = range(2)
 
 
-def build(
-    seed: int,
-    *,
-    length: float = 260.0,
-    boulders: int = 1200,
-    craters: int = 1600,
-    sun_elevation_deg: float = 18.0,
-    sun_azimuth_deg: float = 70.0,
-) -> World:
-    """Ground with a free lane of ``length`` [m] from the origin along +x; the sun stands in direction azimuth from +x.
+@dataclass(frozen=True)
+class Params:
+    """What the ground is like, and where the sun stands."""
 
-    Raises GpvoError for values out of range.
-    """
-    check_ranges(
-        length=(length, 20, 1000), boulders=(boulders, 0, 20000), craters=(craters, 0, 20000),
-        sun_elevation_deg=(sun_elevation_deg, 3, 90), sun_azimuth_deg=(sun_azimuth_deg, -360, 360),
-    )  # fmt: skip
+    length: float = within(260.0, 20, 1000)  # of the lane [m]
+    boulders: int = within(1200, 0, 20000)
+    craters: int = within(1600, 0, 20000)
+    sun_elevation_deg: float = within(18.0, 3, 90)
+    sun_azimuth_deg: float = within(70.0, -360, 360)  # from +x
+
+
+def build(seed: int, params: Params) -> World:
+    """Ground with a free lane from the origin along +x."""
+    length = params.length
     rng = np.random.default_rng([seed, 2])
     x = _spaced(-_BEHIND_M, length + _BEHIND_M, 20.0, _EDGE_M)
     y = _spaced(-_LANE_M, _LANE_M, _EDGE_M, _EDGE_M)
-    z = _heights(x, y, length, craters, rng)
-    elevation, azimuth = np.deg2rad([sun_elevation_deg, sun_azimuth_deg])
+    z = _heights(x, y, length, params.craters, rng)
+    elevation, azimuth = np.deg2rad([params.sun_elevation_deg, params.sun_azimuth_deg])
     sun = np.array([np.cos(elevation) * np.cos(azimuth), np.cos(elevation) * np.sin(azimuth), np.sin(elevation)])
     with ThreadPoolExecutor(2) as pool:
         soil = pool.submit(regolith, _TEXTURE_PX, np.random.default_rng([seed, 2, 1]), sun, _TILE_M)
         stone = pool.submit(rock, _TEXTURE_PX, np.random.default_rng([seed, 2, 2]))
-        mesh, light_map = _mesh(x, y, z, length, boulders, sun, rng)
+        mesh, light_map = _mesh(x, y, z, length, params.boulders, sun, rng)
     fine_x = (x >= -_BEHIND_M - 1e-6) & (x <= length + _BEHIND_M + 1e-6)
     fine_y = np.abs(y) <= _LANE_M + 1e-6
     grid = HeightGrid(z[np.ix_(fine_y, fine_x)].astype(np.float32), float(x[fine_x][0]), float(y[fine_y][0]), _CELL_M)

@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
+
 import numpy as np
 
-from gpvo.sim.worlds import Lighting, Mesh, World, check_ranges
+from gpvo.sim.worlds import Lighting, Mesh, World
 from gpvo.sim.worlds.shapes import Baker, Parts, rectangle
 from gpvo.sim.worlds.textures import F32, Texture, encode, spectral
-from gpvo.types import Array
+from gpvo.types import Array, within
 
 _TEXTURE_PX = 1024
 _PLASTER, _BLOCKS, _PLANKS, _CARDBOARD, _POSTER = 0, 1, 2, 3, 4
@@ -33,30 +35,26 @@ def _box(parts: Parts, material: int, centre: Array, size: Array, heading: float
         _panel(parts, material, 1.2, at, u, v, 0.2, turn + further)
 
 
-def build(
-    seed: int,
-    *,
-    width: float = 12.0,
-    depth: float = 12.0,
-    height: float = 5.0,
-    boxes: int = 14,
-    posters: int = 12,
-    blank_walls: int = 2,
-) -> World:
-    """A hall of ``width`` (x) by ``depth`` (y) by ``height`` [m] about the origin, floor at z = 0.
+@dataclass(frozen=True)
+class Params:
+    """What the hall is like: ``width`` along x, ``depth`` along y, ``height`` [m]."""
 
-    ``blank_walls`` of its four walls are plaster, the others masonry; ``boxes`` stand along them and ``posters``
-    hang on them. Raises GpvoError for values out of range.
-    """
-    check_ranges(
-        width=(width, 6, 60), depth=(depth, 6, 60), height=(height, 2.5, 15),
-        boxes=(boxes, 0, 200), posters=(posters, 0, 100), blank_walls=(blank_walls, 0, 4),
-    )  # fmt: skip
+    width: float = within(12.0, 6, 60)
+    depth: float = within(12.0, 6, 60)
+    height: float = within(5.0, 2.5, 15)
+    boxes: int = within(14, 0, 200)  # along the walls
+    posters: int = within(12, 0, 100)  # on the walls
+    blank_walls: int = within(2, 0, 4)  # of plaster; the others of the four are masonry
+
+
+def build(seed: int, params: Params) -> World:
+    """A hall about the origin, floor at z = 0."""
+    width, depth, height = params.width, params.depth, params.height
     rng = np.random.default_rng([seed, 3])
     size = np.array([width, depth, height])
     parts = Parts()
-    _shell(parts, size, blank_walls, rng)
-    _furnish(parts, size, boxes, posters, rng)
+    _shell(parts, size, params.blank_walls, rng)
+    _furnish(parts, size, params.boxes, params.posters, rng)
     angle = np.linspace(0, 2 * np.pi, 200)
     radius = 0.5 * min(width, depth) - 2.4
     line = np.stack([radius * np.cos(angle), radius * np.sin(angle), np.full(200, 1.4)], axis=1)

@@ -3,16 +3,17 @@
 from __future__ import annotations
 
 from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 
 from gpvo.errors import GpvoError
-from gpvo.sim.worlds import Lighting, Mesh, World, check_ranges
+from gpvo.sim.worlds import Lighting, Mesh, World
 from gpvo.sim.worlds.shapes import Baker, Parts
 from gpvo.sim.worlds.textures import duct, fractal, gravel, lattice, rock, shotcrete
 from gpvo.sim.worlds.tubes import Line, Tube, bolts, lamp_fixtures, pipe, rough_tube, rubble
-from gpvo.types import Array
+from gpvo.types import Array, within
 
 _RADIUS_M = 2.6
 _TILE_M = 3.0
@@ -22,31 +23,27 @@ _SMOOTH_M = 9.0  # length of one smooth stretch
 _ROCK, _SHOTCRETE, _GRAVEL, _DUCT = range(4)
 
 
-def build(
-    seed: int,
-    *,
-    length: float = 160.0,
-    curve: str = "curved",
-    roughness: float = 0.3,
-    smooth_stretches: int = 0,
-    lamps: float = 11.0,
-    step: float = 0.14,
-) -> World:
-    """A tunnel of ``length`` [m] with a lamp every ``lamps`` [m] (0: none) and ``smooth_stretches`` of bare concrete.
+@dataclass(frozen=True)
+class Params:
+    """What a tunnel is like."""
 
-    ``curve``: straight, curved or branching; ``roughness``: height of the rock's relief [m]; ``step``: edge of the
-    triangles [m]. Raises GpvoError for values out of range.
-    """
+    length: float = within(160.0, 20, 2000)  # [m]
+    curve: str = "curved"  # straight, curved or branching
+    roughness: float = within(0.3, 0, 0.6)  # height of the rock's relief [m]
+    smooth_stretches: int = within(0, 0, 50)  # of bare concrete
+    lamps: float = within(11.0, 0, 1000)  # distance between two [m]; 0: none
+    step: float = within(0.14, 0.05, 0.25)  # edge of the triangles [m]
+
+
+def build(seed: int, params: Params) -> World:
+    """A tunnel. Raises GpvoError for an unknown curve."""
+    length, curve, roughness, step = params.length, params.curve, params.roughness, params.step
     if curve not in _CURVES:
         raise GpvoError(f"unknown curve '{curve}' of a tunnel", cure=f"choose from {', '.join(_CURVES)}")
-    check_ranges(
-        length=(length, 20, 2000), roughness=(roughness, 0, 0.6), lamps=(lamps, 0, 1000),
-        step=(step, 0.05, 0.25), smooth_stretches=(smooth_stretches, 0, 50),
-    )  # fmt: skip
     rng = np.random.default_rng([seed, 1])
     values = lattice(rng)
     line = _line(length, step, _CURVES[curve], rng)
-    stretches = _stretches(length, smooth_stretches, rng)
+    stretches = _stretches(length, params.smooth_stretches, rng)
     tubes = [_tube(line, roughness, stretches, step, values, rng)]
     if curve == "branching":
         for at, side in ((0.35, 1), (0.68, -1)):
@@ -55,7 +52,7 @@ def build(
     with ThreadPoolExecutor(2) as pool:
         streams = [np.random.default_rng([seed, 1, k]) for k in range(len(makers))]
         textures = pool.map(lambda make, stream: make(_TEXTURE_PX, stream), makers, streams)
-        mesh = _mesh(tubes, stretches, lamps, values, rng)
+        mesh = _mesh(tubes, stretches, params.lamps, values, rng)
     start = int(6.0 / step)
     pose = np.eye(4)
     pose[:3, :3] = np.stack([line.tangent[start], line.left[start], line.up[start]], axis=1)
