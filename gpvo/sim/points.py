@@ -33,8 +33,6 @@ class PointsFlight:
     the written one.
     """
 
-    name: str
-    seed: int
     scenario: PointsScenario
     frame: NDArray[np.int32]
     track: NDArray[np.int32]
@@ -82,11 +80,9 @@ def simulate_points(scenario: str | PointsScenario, seed: int = 0, **overrides: 
     if isinstance(scenario, str):
         if scenario not in SCENARIOS:
             raise GpvoError(f"unknown points scenario '{scenario}'", cure=f"choose from {', '.join(SCENARIOS)}")
-        name, chosen = scenario, SCENARIOS[scenario]
-    else:
-        name, chosen = "points", scenario
+        scenario = SCENARIOS[scenario]
     try:
-        chosen = replace(chosen, **overrides)  # type: ignore[arg-type]
+        chosen = replace(scenario, **overrides)  # type: ignore[arg-type]
     except TypeError as error:
         cure = "see gpvo.sim.points_scenario.PointsScenario"
         raise GpvoError(f"unknown scenario value: {error}", cure=cure) from None
@@ -101,11 +97,11 @@ def simulate_points(scenario: str | PointsScenario, seed: int = 0, **overrides: 
     path, cloud = clouds.make(
         chosen.world, chosen.path, chosen.duration_s, chosen.speed_mps, scene, chosen.rest_s, chosen.waypoints
     )
-    return _fly(name, seed, chosen, path.motion(chosen.imu_rate_hz), cloud, streams)
+    return _fly(chosen, path.motion(chosen.imu_rate_hz), cloud, streams)
 
 
 def _fly(
-    name: str, seed: int, scenario: PointsScenario, motion: imu.Motion, cloud: Array, streams: list[np.random.Generator]
+    scenario: PointsScenario, motion: imu.Motion, cloud: Array, streams: list[np.random.Generator]
 ) -> PointsFlight:
     at_frames = motion.thinned(scenario.imu_samples_per_frame)
     T_world_cam = se3.from_rt(at_frames.R_world_body, at_frames.position_m) @ T_BODY_CAM
@@ -121,8 +117,6 @@ def _fly(
     seen = observe(scenario, at_frames.t_s, T_world_cam, cloud, episodes, streams, bodies)
     track, uv_left, uv_right = (np.concatenate(of_frames) for of_frames in zip(*seen))
     return PointsFlight(
-        name=name,
-        seed=seed,
         scenario=scenario,
         frame=np.repeat(np.arange(len(seen)), [len(of_frame[0]) for of_frame in seen]).astype(np.int32),
         track=track.astype(np.int32),
