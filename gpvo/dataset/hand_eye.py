@@ -171,8 +171,8 @@ def residuals(A: Array, B: Array, X: Array) -> tuple[Array, Array]:
 
 
 def _spread(r: Array) -> float:
-    """Robust standard deviation per axis, never zero."""
-    return max(1.4826 * float(np.median(np.abs(r))), 1e-9)
+    """Robust standard deviation per axis, never zero: rms of the axes' own, of which planar motions leave some at 0."""
+    return max(1.4826 * float(np.sqrt((np.median(np.abs(r), axis=0) ** 2).mean())), 1e-9)
 
 
 def _in_one_world(B: Array, attitudes: Array, R: Array) -> tuple[Array, Array]:

@@ -49,6 +49,16 @@ def test_planar_motion_leaves_the_height_near_zero():
     assert fit.lever_m < 0.5
 
 
+def test_exactly_planar_motions_and_noise():
+    """As of wheel odometry and a SLAM in the plane: both have exact zeros on three axes."""
+    rng = np.random.default_rng(3)
+    noise = rng.normal(size=(200, 6)) * [5e-3, 5e-3, 0, 0, 0, 2e-3]
+    B = se3.exp(rng.normal(size=(200, 6)) * [0.3, 0, 0, 0, 0, 0.4] + [0.8, 0, 0, 0, 0, 0])
+    planar = se3.exp(np.array([0.4, -0.2, 0, 0, 0, 0.3]))
+    fit = fit_fixed_transform(planar @ B @ se3.inverse(planar) @ se3.exp(noise), B)
+    np.testing.assert_allclose(fit.T_log_truth, planar, atol=5e-3)
+
+
 def test_rotation_alone():
     A, B = _motions(200, 0.001)
     A = se3.inverse(X) @ A @ X
