@@ -22,13 +22,15 @@ class FixedRotation:
     """``rotvec_rad`` (3,) from the truth's camera to the log's, and ``lever_m`` between their origins, 0 where a lever
     arm does not matter; ``scale``: size of the odometry's motions relative to the truth's, likewise 1;
     ``error_change``: relative change without them of the median error over a second, on the halves of the run that they
-    were not fitted to."""
+    were not fitted to; ``align_change``: the same where no scale is fitted, as by ``--align``, 0 where that does not
+    matter."""
 
     angle_deg: float
     rotvec_rad: tuple[float, ...]
     error_change: float
     lever_m: float = 0.0
     scale: float = 1.0
+    align_change: float = 0.0
 
 
 MATTERS = -0.1
@@ -39,7 +41,7 @@ def fixed_rotation(log: VoLog, truth: TruthLog) -> FixedRotation | None:
     """A fixed rotation between truth and odometry, a lever arm if it matters beside that, and a scale if it matters
     beside both, which they may only stand in for; None where none shows or matters."""
     A, B, _ = windowed_motions(log, truth)
-    half, found = len(A) // 2, None
+    half, found, aligned = len(A) // 2, None, 0.0
     if half < MIN_MOTIONS:
         return None
     parts = slice(None, half), slice(half, None)
@@ -55,7 +57,8 @@ def fixed_rotation(log: VoLog, truth: TruthLog) -> FixedRotation | None:
                 (X, scale), change = fits[0], float(_change(left, plain, B).mean())
                 rotvec, lever_m = se3.so3_log(X[:3, :3]), float(np.linalg.norm(X[:3, 3]))
                 angle_deg = float(np.rad2deg(np.linalg.norm(rotvec)))
-                found, least = FixedRotation(angle_deg, tuple(rotvec.tolist()), change, lever_m, scale), left
+                aligned = aligned if by_scale else change
+                found, least = FixedRotation(angle_deg, tuple(rotvec.tolist()), change, lever_m, scale, aligned), left
     return found
 
 

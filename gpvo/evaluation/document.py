@@ -46,9 +46,10 @@ def document(evaluations: Sequence[Evaluation]) -> dict[str, Any]:
       (:func:`gpvo.dataset.truth_noise.estimate_truth_noise`), whichever is larger. ``truth_sigma_axes``: by axis, x y z
       [m], then [rad], over the run. ``truth_jitter_s``: the jitter of its stamps that these hold.
       ``truth_tells_from_m``: length of path from which odometry's errors outweigh it; 0: every motion; None: nowhere.
-    * ``fixed_rotation`` {``angle_deg``, ``rotvec_rad``, ``error_change``, ``lever_m``, ``scale``}: between truth and
-      odometry, None if nothing of it matters; ``lever_m`` between their origins, 0 if that does not, and ``scale`` of
-      the odometry's motions, 1 if that does not; ``error_change``: relative change of errors over a second without.
+    * ``fixed_rotation`` {``angle_deg``, ``rotvec_rad``, ``error_change``, ``lever_m``, ``scale``, ``align_change``}:
+      between truth and odometry, None if nothing of it matters; ``lever_m`` between their origins, 0 if that does not,
+      and ``scale`` of the odometry's motions, 1 if that does not; ``error_change``: relative change of errors over a
+      second without; ``align_change``: of what ``--align`` takes off, which fits no scale.
     * ``inverse_poses`` {``of``, ``error_change``, ``or_backwards``}: whose poses seem inverse; None: nobody's.
     * ``unlike`` {``scale``, ``motion``, ``turn``, ``path``}: how little odometry and truth resemble each other
       (:class:`gpvo.dataset.misread.Resemblance`), None where they do.

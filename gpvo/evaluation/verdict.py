@@ -32,6 +32,7 @@ HONEST = (0.5, 2.0)
 _FEW_WINDOWS = 5
 _FEW_BARE = 0.01  # of the frames, without truth: its ends
 _LEAST_PATH_M, _MOST_SCALE = 0.5, 1.5
+_LEAST_DEG = 0.005  # that is not 0.00
 _FAR, _FEW_FAR, _OUTWEIGH = 20.0, 0.05, 0.5  # medians; share of the motions; of the sum of all squared errors
 
 Colour = Literal["green", "amber", "red"]
@@ -274,15 +275,16 @@ def _conditions(e: Evaluation) -> Iterator[str]:
 def _of_frames(turned: FixedRotation, camera: StereoCamera | None) -> str:
     # So large, it is rarely a mounting: a quaternion with w first read as x first, or a body's poses as a camera's.
     asked = "; are the quaternion's order and --frame right?" if turned.angle_deg > GROSS_DEG else ""
-    apart = f" and a lever arm of {turned.lever_m:.3g} m" if turned.lever_m else ""
-    without = f"Without it, errors over a second are {-100 * turned.error_change:.0f} % smaller"
-    if turned.scale != 1.0 and not turned.angle_deg:
-        return f"{_of_size('motions are', turned.scale, camera)} {without}."
-    size = f" {_of_size('motions are', turned.scale, camera)}" * (turned.scale != 1.0)
+    is_turned, smaller = turned.angle_deg >= _LEAST_DEG, f"{-100 * turned.error_change:.0f} % smaller"
+    parts = [f"a fixed rotation of {turned.angle_deg:.2f} deg"] * is_turned
+    parts += [f"a lever arm of {turned.lever_m:.3g} m"] * (turned.lever_m > 0)
+    size = _of_size("motions are", turned.scale, camera) if turned.scale != 1.0 else ""
+    if size and not turned.align_change:  # --align fits no size, and beside it there is nothing left to fit
+        return f"{size} Without {' and '.join(['it', *parts])}, errors over a second are {smaller}."
     return (
-        f"Truth and odometry differ by a fixed rotation of {turned.angle_deg:.2f} deg{apart}"
-        f" (mounting, calibration, or a steady bias of the odometry{asked}).{size} {without}"
-        f" (--align {'transform' if apart else 'rotation'}{', but nothing takes off the size' if size else ''})."
+        f"Truth and odometry differ by {' and '.join(parts)} (mounting, calibration, or a steady bias of the"
+        f" odometry{asked}).{f' {size}' * bool(size)} Without it, errors over a second are {smaller} (--align"
+        f" {'transform' if turned.lever_m else 'rotation'}{', but nothing takes off the size' * bool(size)})."
     )
 
 

@@ -214,6 +214,29 @@ def test_a_scale_is_not_taken_for_a_lever_arm_nor_hides_one(factor: float, lever
     assert found.lever_m == pytest.approx(lever_m, abs=0.05)
 
 
+@pytest.mark.parametrize(("align_change", "advised"), [(0.0, False), (-0.2, True)])
+def test_align_is_advised_only_where_it_helps(align_change: float, advised: bool) -> None:
+    """It fits no size: what fits only beside another size was advised again and again, with a rotation of 0.00 deg."""
+    turned = FixedRotation(0.001, (0.0, 0.0, 2e-5), -0.49, lever_m=0.0734, scale=0.974, align_change=align_change)
+    [line] = [t for t in verdict(replace(evaluated({}), turned=turned)).lines if "0.974 times" in t]
+    assert "fixed rotation" not in line
+    assert ("--align transform, but nothing takes off the size" in line) is advised
+    assert ("Without it and a lever arm of 0.0734 m, errors over a second are 49 % smaller." in line) is not advised
+
+
+def test_what_a_scale_alone_explains_is_no_gain_of_align() -> None:
+    log, truth = make_run(600, v_t=False)
+    log = replace(log, records=[replace(r, T_prev_cur=_scaled(r.T_prev_cur, 0.9)) for r in log])
+    turned = {
+        lever: fixed_rotation(log, replace(truth, T_world_cam=truth.T_world_cam @ X)) for lever, X in _ARMS.items()
+    }
+    assert turned[0.0].align_change == 0.0
+    assert turned[0.4].error_change < turned[0.4].align_change < -0.1
+
+
+_ARMS = {0.0: np.eye(4), 0.4: se3.exp(np.array([0.4, 0.0, 0.0, 0.2, 0.0, 0.0]))}
+
+
 def _scaled(T: Array, factor: float) -> Array:
     return se3.from_rt(T[:3, :3], factor * T[:3, 3])
 
