@@ -32,7 +32,7 @@ HONEST = (0.5, 2.0)
 _FEW_WINDOWS = 5
 _FEW_BARE = 0.01  # of the frames, without truth: its ends
 _LEAST_PATH_M, _MOST_SCALE = 0.5, 1.5
-_LEAST_DEG = 0.005  # that is not 0.00
+_LEAST_DEG, _ROUNDING = 0.005, 1e-9  # that is not 0.00; of a truth [m or rad]
 _FAR, _FEW_FAR, _OUTWEIGH = 20.0, 0.05, 0.5  # medians; share of the motions; of the sum of all squared errors
 
 Colour = Literal["green", "amber", "red"]
@@ -233,7 +233,7 @@ def _conditions(e: Evaluation) -> Iterator[str]:
             f"The model calls {by_model} of {len(e.run.log)} motions lost, most as slips: more abrupt than the"
             " vehicle can be; if yours can, raise --max-acceleration in gpvo run or gpvo import."
         )
-    if (e.truth_sigma > 1.5 * e.truth_sigma_stated).any():
+    if (e.truth_sigma > np.maximum(1.5 * e.truth_sigma_stated, _ROUNDING)).any():
         stated = _up_to(e.truth_sigma_stated) or "none"
         jitter = f", as its stamps jitter by {1e3 * e.truth_jitter_s:.2g} ms" if e.truth_jitter_s else ""
         yield (

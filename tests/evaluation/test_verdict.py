@@ -214,6 +214,13 @@ def test_a_scale_is_not_taken_for_a_lever_arm_nor_hides_one(factor: float, lever
     assert found.lever_m == pytest.approx(lever_m, abs=0.05)
 
 
+@pytest.mark.parametrize(("sigma", "told"), [(1e-17, False), (1e-4, True)])
+def test_rounding_is_no_noise_of_a_truth(sigma: float, told: bool) -> None:
+    """As on the axes along which an exactly planar one does not move."""
+    found = verdict(replace(evaluated({"triangulation": 1.0}), truth_sigma=np.full(6, sigma)))
+    assert any("has an estimated noise" in line for line in found.lines) is told
+
+
 @pytest.mark.parametrize(("align_change", "advised"), [(0.0, False), (-0.2, True)])
 def test_align_is_advised_only_where_it_helps(align_change: float, advised: bool) -> None:
     """It fits no size: what fits only beside another size was advised again and again, with a rotation of 0.00 deg."""
