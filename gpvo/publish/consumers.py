@@ -19,6 +19,7 @@ import numpy as np
 
 from gpvo.errors import GpvoError
 from gpvo.geometry.covariance import variances
+from gpvo.online.features import AXES
 from gpvo.publish.odometry import Odometry
 from gpvo.types import Array
 
@@ -47,30 +48,48 @@ def fusioncore_sigmas(covariance: Array) -> Array:
 
 
 @dataclass(frozen=True)
+class Axis:
+    """``predicted_sigma``: its 5th, 50th and 95th percentile; ``hidden_percent``: share of frames in which a floor is
+    above it; ``name``: empty where there is only one."""
+
+    name: str
+    predicted_sigma: tuple[float, float, float]
+    unit: str
+    hidden_percent: float
+
+    def __str__(self) -> str:
+        low, middle, high = self.predicted_sigma
+        return f"{self.name} {low:.3g} / {middle:.3g} / {high:.3g} {self.unit}".lstrip()
+
+
+@dataclass(frozen=True)
 class Verdict:
-    """What a consumer does with one quantity: the share of frames in which its floor hides what was predicted."""
+    """What a consumer does with one quantity: ``hidden_percent`` of the frames have something hidden, an axis or a
+    combination of them."""
 
     quantity: str
     parameter: str
     value: float | None  # None where what hides the covariance is no number
     hidden_percent: float
-    predicted_sigma: tuple[float, float, float]  # its 5th, 50th and 95th percentile
-    unit: str
+    axes: tuple[Axis, ...]
     advice: str = ""
 
     def __str__(self) -> str:
-        low, middle, high = self.predicted_sigma
         value = "" if self.value is None else f" = {self.value:g}"
+        sigmas, shares = ", ".join(map(str, self.axes)), [f"{a.hidden_percent:.0f} %" for a in self.axes]
+        hides = f"it in {shares[0]}"
+        if len(set(shares)) > 1:
+            hides = ", ".join(f"{a.name} in {share}" for a, share in zip(self.axes, shares, strict=True))
         line = (
-            f"{self.quantity}: predicted sigma {low:.3g} / {middle:.3g} / {high:.3g} {self.unit} (5, 50, 95 %); "
-            f"{self.parameter}{value} hides it in {self.hidden_percent:.0f} % of frames"
+            f"{self.quantity}: predicted sigma {sigmas} (5, 50, 95 %); {self.parameter}{value} hides {hides} of frames"
         )
         return line + (f". {self.advice}" if self.advice else "")
 
     def document(self) -> dict[str, Any]:
         """Machine-readable form."""
-        sigma = dict(zip(("p5", "p50", "p95"), self.predicted_sigma, strict=True))
-        return {**vars(self), "predicted_sigma": sigma, "advice": self.advice or None}
+        names = "p5", "p50", "p95"
+        axes = [{**vars(a), "predicted_sigma": dict(zip(names, a.predicted_sigma, strict=True))} for a in self.axes]
+        return {**vars(self), "axes": axes, "advice": self.advice or None}
 
 
 def check(odometry: Sequence[Odometry], consumer: str) -> list[Verdict]:
@@ -86,9 +105,14 @@ def check(odometry: Sequence[Odometry], consumer: str) -> list[Verdict]:
 
 
 def _check_robot_localization(pose: Array, twist: Array) -> list[Verdict]:
-    pairs = (("twist", twist, "m/s, rad/s"), ("pose", pose, "m, rad"))
-    smallest = ((quantity, np.sqrt(variances(C)).min(axis=1), unit) for quantity, C, unit in pairs)
-    return [_verdict(q, "variance floor", 1e-9, sigma, unit, floor=1e-9**0.5) for q, sigma, unit in smallest]
+    pose, twist = np.sqrt(variances(pose)), np.sqrt(variances(twist))
+    parts = (
+        ("velocity", twist[:, :3], "m/s"),
+        ("turn rate", twist[:, 3:], "rad/s"),
+        ("position", pose[:, :3], "m"),
+        ("orientation", pose[:, 3:], "rad"),
+    )
+    return [_verdict(q, "variance floor", 1e-9, sigma, unit, floor=1e-9**0.5) for q, sigma, unit in parts]
 
 
 def _check_px4(pose: Array, twist: Array) -> list[Verdict]:
@@ -97,11 +121,11 @@ def _check_px4(pose: Array, twist: Array) -> list[Verdict]:
     for quantity, name, sigma, unit in (
         ("velocity", "EKF2_EVV_NOISE", twist[:, :3], "m/s"),
         ("position", "EKF2_EVP_NOISE", pose[:, :3], "m"),
-        ("yaw", "EKF2_EVA_NOISE", pose[:, 5:6], "rad"),
+        ("yaw", "EKF2_EVA_NOISE", pose[:, 5], "rad"),
     ):
         value, minimum = PX4[name]
         typical = 0.05 if quantity == "velocity" else 0.5
-        out.append(_verdict(quantity, name, value, sigma.min(axis=1), unit, minimum=minimum, typical=typical))
+        out.append(_verdict(quantity, name, value, sigma, unit, minimum=minimum, typical=typical))
     return out
 
 
@@ -111,15 +135,18 @@ def _check_fusioncore(pose: Array, twist: Array) -> list[Verdict]:
     out, read = [], [0, 1, 5]
     planar = twist[:, read][:, :, read]
     used = np.array([fusioncore_sigmas(C) for C in pose])
-    for quantity, C, sigma, unit, reads in (
-        ("twist", planar, np.sqrt(variances(planar)), "m/s, rad/s", "vx, vy and the yaw rate as an encoder's"),
-        ("pose", pose, used, "m, rad", "the pose as VSLAM's, to no less than 0.01 m and 0.001 rad"),
+    of_twist = ("vx", "m/s"), ("vy", "m/s"), ("yaw rate", "rad/s")
+    of_pose = tuple(zip(AXES, ("m",) * 3 + ("rad",) * 3, strict=True))
+    for quantity, C, sigma, axes, reads in (
+        ("twist", planar, np.sqrt(variances(planar)), of_twist, "vx, vy and the yaw rate as an encoder's"),
+        ("pose", pose, used, of_pose, "the pose as VSLAM's, to no less than 0.01 m and 0.001 rad"),
     ):
         hidden = np.linalg.eigvalsh(C / (sigma[:, :, None] * sigma[:, None, :]))[:, 0] < 0.25
-        predicted = _percentiles(np.sqrt(variances(C)).min(axis=1))
+        percent, stated = 100.0 * float(hidden.mean()), np.sqrt(variances(C))
+        told = (Axis(name, _percentiles(s), unit, percent) for (name, unit), s in zip(axes, stated.T, strict=True))
         advice = f"It reads {reads}, and its chi-square gate is only as good as these sigmas; send no zeros"
-        percent, cause = 100.0 * float(hidden.mean()), "use of the diagonal alone"
-        out.append(Verdict(quantity, cause, None, percent, predicted, unit, advice))
+        cause = "use of the diagonal alone"
+        out.append(Verdict(quantity, cause, None, percent, tuple(told), advice))
     return out
 
 
@@ -144,7 +171,7 @@ def _check_ardupilot(pose: Array, twist: Array) -> list[Verdict]:
         "ODOMETRY's quality decide frame by frame, but drops every VISION_SPEED_ESTIMATE, which has none; below 0 it "
         "would accept frames far outside the model's domain"
     )
-    return [*out, Verdict("velocity otherwise", name, value, 100.0, predicted, "m/s", advice)]
+    return [*out, Verdict("velocity otherwise", name, value, 100.0, (Axis("", predicted, "m/s", 100.0),), advice)]
 
 
 def _percentiles(sigma: Array) -> tuple[float, float, float]:
@@ -163,14 +190,18 @@ def _verdict(
     typical: float = 0.5,
     floor: float | None = None,
 ) -> Verdict:
-    """``typical``: the quantile of the predicted sigma that the parameter should not exceed. A velocity's sigma has a
-    usual level and its low end matters; a pose's grows from nothing, so its middle does."""
-    predicted = _percentiles(sigma)
+    """Of a ``sigma`` (n,), or (n, 3) of axes. ``typical``: its quantile, of every axis, that the parameter should not
+    exceed. A velocity's has a usual level and its low end matters; a pose's grows from nothing, so its middle does."""
+    names, sigma = "xyz" if sigma.ndim > 1 else ("",), sigma.reshape(len(sigma), -1)
     # Variances were lifted to the one floor, up to rounding.
-    hidden = 100.0 * float((sigma < (value if floor is None else floor * (1 + 1e-6))).mean())
-    advice, wanted = "", float(np.quantile(sigma, typical))
+    below = sigma < (value if floor is None else floor * (1 + 1e-6))
+    shares = zip(names, sigma.T, 100.0 * below.mean(axis=0), strict=True)
+    axes = tuple(Axis(axis, _percentiles(s), unit, float(share)) for axis, s, share in shares)
+    hidden, wanted = 100.0 * float(below.any(axis=1).mean()), float(np.quantile(sigma, typical, axis=0).min())
+    advice = ""
     if hidden > 1.0 and floor is None and wanted < value:
         advice = f"Set {name} to {max(wanted, minimum):.2g}"
         if wanted < minimum:
-            advice += f", the smallest it accepts, which hides {100 * float((sigma < minimum).mean()):.0f} %"
-    return Verdict(quantity, name, value, hidden, predicted, unit, advice)
+            still = 100 * float((sigma < minimum).any(axis=1).mean())
+            advice += f", the smallest it accepts, which hides {'an axis in ' * (len(axes) > 1)}{still:.0f} %"
+    return Verdict(quantity, name, value, hidden, axes, advice)

@@ -87,11 +87,11 @@ def test_check_names_the_parameter_that_hides_the_prediction(odometry: list[Odom
     assert not velocity.advice
     tiny = [replace(o, twist_covariance=np.eye(6) * 1e-3**2) for o in odometry]
     velocity = next(v for v in consumers.check(tiny, "px4") if v.quantity == "velocity")
-    assert "Set EKF2_EVV_NOISE to 0.01, the smallest it accepts, which hides 100 %" in velocity.advice
+    assert "Set EKF2_EVV_NOISE to 0.01, the smallest it accepts, which hides an axis in 100 %" in velocity.advice
     part = [replace(o, twist_covariance=np.eye(6) * (1e-3 if k % 4 else 2e-2) ** 2) for k, o in enumerate(odometry)]
     velocity = next(v for v in consumers.check(part, "px4") if v.quantity == "velocity")
     hidden = 100 * np.mean([k % 4 > 0 for k in range(len(odometry))])
-    assert velocity.advice.endswith(f"which hides {hidden:.0f} %")
+    assert velocity.advice.endswith(f"which hides an axis in {hidden:.0f} %")
 
 
 def test_check_of_the_others(odometry: list[Odometry]) -> None:
@@ -107,17 +107,33 @@ def test_check_of_the_others(odometry: list[Odometry]) -> None:
     # VISION_SPEED_ESTIMATE's covariance is taken for one sigma, the root of its trace, but not below the parameter.
     assert "Set VISO_VEL_M_NSE to 0.05, the smallest it accepts" in speed.advice
     assert speed.hidden_percent == 100.0
-    assert speed.predicted_sigma == pytest.approx(((3e-4) ** 0.5,) * 3)
+    assert speed.axes[0].predicted_sigma == pytest.approx(((3e-4) ** 0.5,) * 3)
     loud = [replace(o, twist_covariance=np.eye(6) * 0.06**2) for o in odometry]
     assert consumers.check(loud, "ardupilot")[4].hidden_percent == 0.0
     assert all(v.hidden_percent == 0 for v in consumers.check(odometry, "robot_localization"))
     lifted = [replace(o, twist_covariance=lift(np.eye(6) * 1e-12, 1e-9)) for o in odometry]
-    assert [v.hidden_percent for v in consumers.check(lifted, "robot_localization")] == [100.0, 0.0]
+    assert [v.hidden_percent for v in consumers.check(lifted, "robot_localization")] == [100.0, 100.0, 0.0, 0.0]
     for axis in range(6):  # it floors each of them
         one = [replace(o, twist_covariance=np.diag(np.where(np.arange(6) == axis, 1e-12, 1.0))) for o in odometry]
-        assert [v.hidden_percent for v in consumers.check(one, "robot_localization")] == [100.0, 0.0]
+        verdicts = consumers.check(one, "robot_localization")
+        hidden = [a.hidden_percent for v in verdicts for a in v.axes]
+        assert hidden == [100.0 * (k == axis) for k in range(12)]
+        assert [v.hidden_percent for v in verdicts] == [100.0 * (axis < 3), 100.0 * (axis >= 3), 0.0, 0.0]
     with pytest.raises(GpvoError, match="unknown consumer"):
         consumers.check(odometry, "betaflight")
+
+
+def test_a_check_speaks_of_each_axis_and_mixes_no_units(odometry: list[Odometry]) -> None:
+    """The smallest axis was shown as the sigma, and what hides it as what hides all."""
+    sigma = np.array([0.05, 0.2, 0.3, 0.001, 0.002, 0.003])
+    frames = [replace(o, twist_covariance=np.diag(sigma**2)) for o in odometry]
+    velocity = str(consumers.check(frames, "px4")[0])
+    assert "x 0.05 / 0.05 / 0.05 m/s, y 0.2 / 0.2 / 0.2 m/s, z 0.3 / 0.3 / 0.3 m/s (5, 50, 95 %)" in velocity
+    assert "hides x in 100 %, y in 0 %, z in 0 % of frames. Set EKF2_EVV_NOISE to 0.05" in velocity
+    twist = str(consumers.check(frames, "fusioncore")[0])
+    assert "vx 0.05 / 0.05 / 0.05 m/s, vy 0.2 / 0.2 / 0.2 m/s, yaw rate 0.003 / 0.003 / 0.003 rad/s" in twist
+    told = [str(v) for v in consumers.check(frames, "robot_localization")]
+    assert [line.split(":")[0] for line in told] == ["velocity", "turn rate", "position", "orientation"]
 
 
 def test_check_reads_of_each_axis_what_the_consumer_reads(odometry: list[Odometry]) -> None:
@@ -129,15 +145,18 @@ def test_check_reads_of_each_axis_what_the_consumer_reads(odometry: list[Odometr
     ]
     cube = (0.3**4 + 0.4**4 + 1.2**4) ** (1 / 3), (0.02**4 + 0.03**4 + 0.06**4) ** (1 / 3)
     middle = {
-        "px4": [0.02, 0.3, 0.06],
+        "px4": [*of_twist[:3], *of_pose[:3], 0.06],
         "ardupilot": [1.3, cube[0], 0.07, cube[1], 0.07, 0.06],
-        "robot_localization": [0.02, 0.02],
+        "robot_localization": [*of_twist, *of_pose],
+        "fusioncore": [0.02, 0.03, 6.0, *of_pose],
     }
     for consumer, sigmas in middle.items():
         found = consumers.check(frames, consumer)
-        assert [v.predicted_sigma[1] for v in found] == pytest.approx(sigmas, rel=0.02)
+        assert [a.predicted_sigma[1] for v in found for a in v.axes] == pytest.approx(sigmas, rel=0.02)
     # A velocity's sigma has a usual level, whose low end must not be hidden; of a pose's, which grows, the middle.
-    velocity, _, yaw = consumers.check(frames, "px4")
+    velocity, position, yaw = consumers.check(frames, "px4")
+    assert "hides it in 100 % of frames" in str(velocity)
+    assert "x 0.165 / 0.3 / 0.435 m, y" in str(position)
     assert "Set EKF2_EVV_NOISE to 0.011" in velocity.advice
     assert "Set EKF2_EVA_NOISE to 0.06" in yaw.advice
 
@@ -153,7 +172,7 @@ def test_fusioncore_floors_a_pose_and_replaces_what_holds_a_zero(odometry: list[
     sharp = [replace(o, twist_covariance=np.eye(6), pose_covariance=np.eye(6) * 1e-8) for o in odometry]
     twist, pose = consumers.check(sharp, "fusioncore")
     assert (twist.hidden_percent, pose.hidden_percent) == (0.0, 100.0)
-    assert pose.predicted_sigma == pytest.approx((1e-4, 1e-4, 1e-4))
+    assert all(a.predicted_sigma == pytest.approx((1e-4, 1e-4, 1e-4)) for a in pose.axes)
 
 
 def test_fusioncore_loses_what_lies_in_correlations(odometry: list[Odometry]) -> None:
