@@ -99,10 +99,10 @@ def _preamble(model: ErrorModel, units: tuple[str, ...], note: str) -> list[str]
         for i, (c, u) in enumerate(zip(model.columns, units))
     ]
     return [
-        "/* Error model of stereo visual odometry, written by gpvo. No dependency but math.h; no heap; no state.",
+        "/* Error model of stereo visual odometry, written by gpvo. C99 and math.h alone; no heap; no state.",
         *([f" * {_comment(note)}"] if note else []),
         " *",
-        " * Features, in order:",
+        " * Features, in order; their formulas: docs/concepts/features.rst of gpvo.",
         *features,
         " */",
         "#ifndef GPVO_MODEL_H",

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import ctypes
+import re
 import shutil
 import subprocess
 from dataclasses import replace
@@ -17,6 +18,7 @@ from gpvo.online import modelfile
 from gpvo.online.base import COASTED, BaseVariance, Velocities, base_columns
 from gpvo.online.division import PARTS, Division
 from gpvo.online.estimate import ErrorModel
+from gpvo.online.features import known_columns
 from gpvo.online.projected import ProjectedGP
 from gpvo.publish.export import export_model, to_c
 from gpvo.publish.onnx import to_onnx
@@ -319,3 +321,14 @@ def test_predictions_where_something_else_is(tmp_path: Path) -> None:
 def test_unknown_formats_are_refused(tmp_path: Path) -> None:
     with pytest.raises(GpvoError, match="one of: onnx, c"):
         export_model(tmp_path / "model", tmp_path / "out", "fortran")
+
+
+def test_the_page_that_a_header_names_defines_every_feature(tmp_path: Path) -> None:
+    root = Path(__file__).parents[2]
+    export_model(root / "models" / "tunnel.gpvo", tmp_path / "model.h", "c")
+    assert "their formulas: docs/concepts/features.rst" in (tmp_path / "model.h").read_text()
+    formulas = (root / "docs" / "concepts" / "features.rst").read_text().split("\nFormulas\n")[1]
+    of_axes = re.compile("_r?[xyz](_|$)|_det_")  # listed from the first to the last
+    names = [c for c in known_columns() if not of_axes.search(c)]
+    assert "ln_jerk_lately" in names
+    assert not [n for n in names if f"``{n}``" not in formulas]
