@@ -149,14 +149,16 @@ def begin(flight: Flight, options: FuseOptions) -> tuple[Start, Array | None]:
     """
     sigmas, valid = options.sigmas, np.flatnonzero(flight.known)
     t_ns = VoLog(flight.records).t_ns[valid]
+    can_start_on_truth = flight.has_truth and len(valid) > 1
+    otherwise = "use --init truth" if can_start_on_truth else f"{NO_TRUTH}; or fuse a recording that begins at rest"
     if options.init == "static":
         if flight.imu is None:
             cure = "use --init truth" if flight.has_truth else NO_TRUTH
             raise GpvoError("a static start needs an IMU", where=flight.name, cure=cure)
         if not flight.has_truth:
-            return from_rest(flight.imu, flight.records[flight.first].t_ns, sigmas), None
+            return from_rest(flight.imu, flight.records[flight.first].t_ns, sigmas, otherwise=otherwise), None
     elif not flight.has_truth:
-        cure = NO_TRUTH if flight.imu is None else f"{NO_TRUTH}; nor does --init static"
+        cure = NO_TRUTH if flight.imu is None else f"{NO_TRUTH}; nor does --init static, at rest"
         raise GpvoError("--init truth needs ground truth", where=flight.name, cure=cure)
     elif len(valid) < 2:
         raise GpvoError("ground truth covers fewer than two frames", where=flight.name, cure="use --init static")
@@ -166,7 +168,7 @@ def begin(flight: Flight, options: FuseOptions) -> tuple[Start, Array | None]:
         up, tilt, note = _vertical(flight.imu, t_ns, T, sigmas)
     if options.init == "static":
         assert flight.imu is not None
-        start = from_rest(flight.imu, int(t_ns[0]), sigmas, T_world_imu=T[0], up_world=up)
+        start = from_rest(flight.imu, int(t_ns[0]), sigmas, T_world_imu=T[0], up_world=up, otherwise=otherwise)
     else:
         start = from_truth(t_ns[:5], T[:5], sigmas, with_imu=flight.imu is not None)
         start.covariance[TH, TH] += T[0, :3, :3].T @ tilt @ T[0, :3, :3]

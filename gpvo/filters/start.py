@@ -114,12 +114,13 @@ def from_rest(
     *,
     T_world_imu: Array | None = None,
     up_world: Array | None = None,
+    otherwise: str = "use --init truth",
 ) -> Start:
     """Start from a vehicle at rest at ``t_ns``: tilt from gravity, gyroscope bias from the mean rate.
 
     ``T_world_imu`` (4, 4): gives position and heading, zero by default; ``up_world``: unit vector (3,), by default z.
     An accelerometer bias tilts the horizon by bias / g; the covariance carries that correlation. Raises
-    ``GpvoError`` where the IMU says that the vehicle moves.
+    ``GpvoError``, with ``otherwise`` for a cure, where the IMU says that the vehicle moves.
     """
     sigmas, span, good = sigmas or StartSigmas(), round(_REST_S * 1e9), usable(imu)
     window = good & (imu.t_ns >= t_ns) & (imu.t_ns <= t_ns + span)
@@ -128,7 +129,7 @@ def from_rest(
     if window.sum() < _REST_SAMPLES:
         raise GpvoError(f"a static start needs {_REST_SAMPLES} IMU samples within {_REST_S} s of the first frame")
     gyro, acc = imu.gyro_radps[window], imu.acc_mps2[window]
-    _require_rest(gyro, acc)
+    _require_rest(gyro, acc, otherwise)
 
     f = acc.mean(axis=0)
     up = f / np.linalg.norm(f)
@@ -151,7 +152,7 @@ def from_rest(
     return Start(_member(T[:3, 3], np.zeros(3), R, np.zeros(3), gyro.mean(axis=0)), C, note)
 
 
-def _require_rest(gyro: Array, acc: Array) -> None:
+def _require_rest(gyro: Array, acc: Array, cure: str) -> None:
     off_gravity = abs(float(np.linalg.norm(acc.mean(axis=0))) - STANDARD_GRAVITY_MPS2)
     limits = (
         ("gyroscope spread", gyro.std(axis=0).max(), _MOST_GYRO_STD_RADPS, "rad/s"),
@@ -161,7 +162,7 @@ def _require_rest(gyro: Array, acc: Array) -> None:
     )
     reasons = ", ".join(f"{what} {value:.2g} {unit}" for what, value, limit, unit in limits if value > limit)
     if reasons:
-        raise GpvoError(f"the vehicle is not at rest at the start: {reasons}", cure="use --init truth")
+        raise GpvoError(f"the vehicle is not at rest at the start: {reasons}", cure=cure)
 
 
 def _leveled(up: Array) -> Array:

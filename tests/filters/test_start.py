@@ -219,7 +219,14 @@ def test_missing_inputs_are_one_line() -> None:
         begin(blind, FuseOptions())
     with pytest.raises(GpvoError, match="needs an IMU.*use --init truth"):
         begin(replace(flight, imu=None), FuseOptions(init="static"))
-    # With neither, each start would send to the other.
+    # Without truth, each start would send to the other, as it would with truth of one frame.
+    one = replace(flight, truth_valid=np.arange(len(flight.records)) == 0)
+    for moving in (blind, one):
+        with pytest.raises(GpvoError, match="not at rest.*gpvo import RUN --truth .*--twins .*begins at rest") as told:
+            begin(moving, FuseOptions(init="static"))
+        assert "--init truth" not in str(told.value)
+    with pytest.raises(GpvoError, match="not at rest.*use --init truth"):
+        begin(flight, FuseOptions(init="static"))
     for init in ("truth", "static"):
         with pytest.raises(GpvoError, match=r"gpvo import RUN --truth .*--twins needs none, for a run with tracks\)"):
             begin(replace(blind, imu=None), FuseOptions(init=init))
