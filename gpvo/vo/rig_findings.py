@@ -22,7 +22,7 @@ from gpvo.types import Array, StereoCamera
 from gpvo.vo.rig_error import N_TERMS, ORDER, POWERS, RigState, terms
 
 STATE_FILE = "calibration_state.json"
-_WORTH_PX = 0.2  # at half the width of the image; below, no one would calibrate anew
+_WORTH_PX = 0.2  # somewhere in the image; below, no one would calibrate anew
 _SIGMAS = 4.0
 _STEP = 1e-5  # of numeric derivatives [rad, -]
 
@@ -40,7 +40,7 @@ _NAMES = [f"{d}:{t}" for d in ("dx", "dy") for t in _TERMS]
 
 def findings(state: RigState, camera: StereoCamera) -> list[str]:
     """What the state says, one line each; empty for a calibration that fits."""
-    half = 0.5 * camera.width / camera.fx_px
+    half, half_high = 0.5 * camera.width / camera.fx_px, 0.5 * camera.height / camera.fy_px
     sigma = np.sqrt(np.diagonal(state.covariance))
     fx, fy = camera.fx_px, camera.fy_px
 
@@ -61,7 +61,7 @@ def findings(state: RigState, camera: StereoCamera) -> list[str]:
             f"rows tilt: consistent with a rotation of {degrees[roll]:.2f} deg between the cameras about the optical"
             " axis"
         )
-    if shown(row_focal, fy * half):
+    if shown(row_focal, fy * half_high):
         lines.append(
             f"rows spread: consistent with focal lengths that differ by {100 * abs(c[row_focal]):.2f} %, or, if the"
             " camera moves ahead, with left and right images that were not taken at one time"
@@ -72,12 +72,27 @@ def findings(state: RigState, camera: StereoCamera) -> list[str]:
                 f"disparities are off by {-c[0] * fx:+.2f} px: consistent with a rotation of {degrees[0]:.2f} deg"
                 " between the cameras about the vertical axis, or a shift of the principal point"
             )
-        reach_px = fx * half**ORDER
-        at_border = (np.abs(c[:N_TERMS]) * reach_px)[1:]
-        if any(shown(k, reach_px[k]) for k in range(1, N_TERMS)):
-            worst = _TERMS[1 + int(np.argmax(at_border))]
-            lines.append(f"disparities bend over the image by up to {max(at_border):.1f} px, most in {worst}")
+        lines += _bend(state, camera)
     return lines
+
+
+def _bend(state: RigState, camera: StereoCamera) -> list[str]:
+    """How far the polynomial of the disparities, without its constant, goes somewhere in the image: a wide image does
+    not reach where y is large. Said where a term is beyond doubt."""
+    some = slice(1, N_TERMS)
+    c, sigma = state.mean[some], np.sqrt(np.diagonal(state.covariance)[some])
+    over_px = camera.fx_px * terms(*_places(camera))[some]
+    by_term_px = np.abs(c) * np.abs(over_px).max(axis=1)
+    if not ((by_term_px > _WORTH_PX) & (np.abs(c) > _SIGMAS * sigma)).any():
+        return []
+    most = _TERMS[1 + int(np.argmax(by_term_px))]
+    return [f"disparities bend over the image by up to {np.abs(c @ over_px).max():.1f} px, most in {most}"]
+
+
+def _places(camera: StereoCamera) -> tuple[Array, Array]:
+    """Normalised x and y of a grid over the image, each (n,)."""
+    v, u = np.mgrid[0 : camera.height : 9j, 0 : camera.width : 13j]
+    return ((u - camera.cx_px) / camera.fx_px).ravel(), ((v - camera.cy_px) / camera.fy_px).ravel()
 
 
 def document(state: RigState, camera: StereoCamera, start: RigState | None = None) -> dict[str, Any]:
@@ -196,8 +211,7 @@ def _explanation(rig: StereoRig, state: RigState, camera: StereoCamera) -> tuple
 
     To first order, by what each does to the raw image: the focal length of a fisheye does not scale the rectified one.
     """
-    v, u = np.mgrid[0 : camera.height : 9j, 0 : camera.width : 13j]
-    x, y = ((u - camera.cx_px) / camera.fx_px).ravel(), ((v - camera.cy_px) / camera.fy_px).ravel()
+    x, y = _places(camera)
     R_rect = _rectifying(rig)
     raw, seen = rig.right.project(np.column_stack([x, y, np.ones_like(x)]) @ R_rect)
 

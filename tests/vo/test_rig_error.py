@@ -19,7 +19,7 @@ from gpvo.sim.rig import camera_rig
 from gpvo.types import Array, StereoCamera
 from gpvo.vo.covariance import NoiseEstimator
 from gpvo.vo.motion import refine, whitened
-from gpvo.vo.rig_error import N_TERMS, RigError, RigState, prior_covariance, terms
+from gpvo.vo.rig_error import N_TERMS, ORDER, RigError, RigState, prior_covariance, terms
 from gpvo.vo.rig_findings import camchain, corrected, document, explained_px, findings, read_state, rig_of
 
 CAMERA = StereoCamera(380.0, 380.0, 319.5, 239.5, 0.12, 640, 480)
@@ -102,6 +102,23 @@ def test_a_turn_is_found_and_named(axis: int) -> None:
     assert np.abs(state.mean[[0, 1, 2]] - truth[[0, 1, 2]]).max() * CAMERA.fx_px < 0.1
     word = ("horizontal", "vertical", "optical")[axis]
     assert any(f"about the {word} axis" in " ".join(line.split()) for line in findings(state, CAMERA))
+
+
+def test_a_bend_is_as_large_as_in_the_image() -> None:
+    """A car's image of 1241x376: y^3 at half the width would be 36 times what it is at the upper border."""
+    camera = StereoCamera(718.0, 718.0, 620.0, 187.5, 0.54, 1241, 376)
+    x, y = 0.5 * camera.width / camera.fx_px, 0.5 * camera.height / camera.fy_px
+    at_half_width_px = np.zeros(2 * N_TERMS)
+    at_half_width_px[[6, 9]] = 0.7, 5.0  # x^3, y^3
+    reach = np.tile(x**ORDER, 2) * camera.fx_px
+    state = RigState(at_half_width_px / reach, np.diag((0.02 / reach) ** 2), 1.0)
+    largest_px = 0.7 + 5.0 * (y / x) ** 3
+    assert findings(state, camera) == [f"disparities bend over the image by up to {largest_px:.1f} px, most in x^3"]
+    in_doubt = replace(state, covariance=np.diag((0.5 / reach) ** 2))
+    assert findings(in_doubt, camera) == []
+    rows = np.zeros(2 * N_TERMS)
+    rows[N_TERMS + 2] = 0.5 / reach[1]  # the y term: 0.15 px at the upper border
+    assert findings(replace(state, mean=rows), camera) == []
 
 
 @pytest.mark.parametrize("axis", [0, 1, 2])
