@@ -15,6 +15,7 @@ from gpvo.errors import SourceError, counted
 from gpvo.io.stamps import (
     UNITS_NS,
     check_interval,
+    check_padding,
     cure_of_end,
     cure_of_number,
     integer_ns,
@@ -105,6 +106,7 @@ def read_table(path: Path, mapping: Mapping[str, str]) -> Table:
     stamps: list[int] = []
     rows: list[list[float]] = []
     numbers: list[int] = []
+    texts: list[str] = []
     order = [name for name in targets if name not in _STAMPS]
     stamp = next(s for s in _STAMPS if s in targets)
     is_stated = stamp in mapping.values()
@@ -132,9 +134,12 @@ def read_table(path: Path, mapping: Mapping[str, str]) -> Table:
             wrong = next(v for v in values if v.lower() not in _EMPTY and not is_number(v))
             what = f"line {number}: '{wrong}' is not a number"
             raise SourceError(what, where=path, cure=cure_of_number(wrong)) from None
+        texts.append(text)
         numbers.append(number)
     if not rows:
         raise SourceError("holds a header and no rows", where=path)
+    if stamp == "t_s" and rest is None:
+        check_padding(texts, path)
     check_interval(stamps, path, lambda unit: _unit_cure(column, unit), is_stated=is_stated)
     data = np.array(rows, dtype=np.float64)
     unused = tuple(c for k, c in enumerate(header) if k not in targets.values() and _UNCERTAIN.search(c))

@@ -5,6 +5,7 @@ from __future__ import annotations
 import re
 from collections import deque
 from collections.abc import Callable, Iterable, Iterator, Sequence
+from datetime import datetime
 from decimal import Decimal, InvalidOperation
 from functools import partial
 from pathlib import Path
@@ -24,6 +25,8 @@ GAP_FACTOR = 1.75
 BACK_NS = 1_000_000_000  # messages overtake each other on the way to the bag, but not by so much
 PAIR_TOLERANCE_S = 0.002  # between the stamps of left and right
 _WINDOW = 51
+_MANY_STAMPS = 20  # of which some fraction begins with zero
+_DATE = re.compile(r"(\d{4}-\d\d-\d\d)[ T](\d\d:\d\d:\d\d)(\.\d+)?Z?")
 _MAX_BYTES = 2_000_000_000
 _MAX_CHARACTERS = 1_000_000
 UNITS_NS = {"s": 1_000_000_000, "ms": 1_000_000, "us": 1_000, "ns": 1}
@@ -95,6 +98,16 @@ def text_to_ns(text: str, unit: str) -> int:
     return int((value * factor).to_integral_value())
 
 
+def date_to_ns(text: str) -> int | None:
+    """A date in UTC such as ``2011-09-26 13:02:25.964389445``, to nanoseconds since 1970; None for other text.
+
+    Raises ValueError for a day or time that is none.
+    """
+    found = _DATE.fullmatch(text)
+    whole = None if found is None else datetime.fromisoformat(f"{found[1]}T{found[2]}+00:00")
+    return None if found is None or whole is None else text_to_ns(f"{whole.timestamp():.0f}{found[3] or ''}", "s")
+
+
 def likely_unit(text: str) -> str | None:
     """The unit (of :data:`UNITS_NS`) that makes a number a time of 1973 to 2262; for smaller ones seconds, or where
     these would be too many nanoseconds.
@@ -155,6 +168,27 @@ def ns_to_seconds_text(t_ns: int) -> str:
     """Nanoseconds as decimal seconds with nine digits."""
     sign, t = ("-", -int(t_ns)) if t_ns < 0 else ("", int(t_ns))
     return f"{sign}{t // 1_000_000_000}.{t % 1_000_000_000:09d}"
+
+
+def check_padding(texts: Sequence[str], where: object) -> None:
+    """Refuse decimal seconds whose fractions are whole nanoseconds (or others) without their leading zeros: none begins
+    with one, they differ in length, and as whole numbers they make the intervals at least twice as even.
+
+    Raises SourceError.
+    """
+    parts = [text.partition(".")[::2] for text in texts]
+    lengths = {len(fraction) for _, fraction in parts if fraction.strip("0")}
+    if len(texts) < _MANY_STAMPS or len(lengths) < 2 or any(f[:1] == "0" < f.rstrip("0") for _, f in parts):
+        return
+    if not all(re.fullmatch(r"\d{1,12}", whole) and re.fullmatch(r"\d{0,9}", f) for whole, f in parts):
+        return
+    read = np.array([[float(f"0.{f}"), int(f or 0) * 10.0 ** -max(lengths)] for _, f in parts])
+    t_s = np.array([[int(whole) - int(parts[0][0])] for whole, _ in parts]) + read
+    spread_s = np.diff(np.sort(t_s, axis=0), axis=0).std(axis=0)
+    if spread_s[1] < 0.5 * spread_s[0]:
+        odd = next(text for text, (_, f) in zip(texts, parts) if f.strip("0") and len(f) < max(lengths))
+        what = f"the fractions of the stamps, such as {odd}, lack their leading zeros"
+        raise SourceError(what, where=where, cure=f"write seconds and nanoseconds as %d.%0{max(lengths)}d")
 
 
 class _Stamped(Protocol):

@@ -4,6 +4,7 @@ IMU samples beside them."""
 from __future__ import annotations
 
 import math
+import re
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -17,12 +18,15 @@ from gpvo.io.stamps import (
     Stamps,
     astray,
     check_interval,
+    check_padding,
     cure_of_end,
     cure_of_number,
     cure_of_seconds,
     cure_of_unit,
+    date_to_ns,
     growing,
     integer_ns,
+    is_number,
     ns_to_seconds_text,
     seconds_text_to_ns,
     text_lines,
@@ -102,17 +106,20 @@ def read_kitti_poses(path: str | Path) -> Array:
 
 
 def read_times(path: str | Path) -> Stamps:
-    """KITTI's ``times.txt`` (seconds) as (N,) nanoseconds, in the order of the file.
+    """KITTI's ``times.txt`` (seconds) or ``timestamps.txt`` (dates in UTC) as (N,) nanoseconds, in the order of the
+    file; lines of names on top are skipped.
 
     Raises SourceError, naming file and line.
     """
     p = Path(path)
-    stamps = []
+    stamps: list[int] = []
     for number, fields in _fields(p, None):
+        if not stamps and _are_names(fields):
+            continue
         try:
-            if len(fields) != 1:
+            if (date_ns := date_to_ns(" ".join(fields))) is None and len(fields) != 1:
                 raise ValueError(f"{counted(len(fields), 'field')}, expected 1")
-            stamps.append(seconds_text_to_ns(fields[0]))
+            stamps.append(seconds_text_to_ns(fields[0]) if date_ns is None else date_ns)
         except ValueError as error:
             raise SourceError(f"line {number}: {error}", where=p) from None
     return np.array(stamps, dtype=np.int64)
@@ -141,6 +148,11 @@ def _fields(path: Path, separator: str | None) -> Iterator[tuple[int, list[str]]
             yield number, [f.strip() for f in text.split(separator)]
 
 
+def _are_names(fields: list[str]) -> bool:
+    """Whether a line names columns."""
+    return not fields[0][:1].isdigit() and not any(map(is_number, fields))
+
+
 def _floats(path: Path, number: int, fields: list[str], cure: str = REMOVE) -> list[float]:
     try:
         values = [float(f) for f in fields]
@@ -164,7 +176,7 @@ def _read_poses(
     """Lines of a stamp and the seven numbers of a pose, where ``q_xyzw`` of these are the quaternion; and what follows
     them in each line, up to the least of the ``counts`` of fields that are allowed, ``what`` in words."""
     numbers: list[int] = []
-    stamps, poses, behind = [], [], []
+    texts, stamps, poses, behind = list[str](), [], [], []
     for number, fields in _fields(path, separator):
         if len(fields) not in counts:
             cure = cure_of_end(path, number) if numbers and len(fields) < counts.start else None
@@ -178,12 +190,14 @@ def _read_poses(
             cure = cure_of_seconds(fields[0]) if stamp is seconds_text_to_ns else None
             cure = cure or cure_of_number(fields[0])
             raise SourceError(f"line {number}: {error}", where=path, cure=cure) from None
+        texts.append(fields[0])
         numbers.append(number)
         poses.append(_floats(path, number, fields[1:8]))
         behind.append(fields[8 : counts.start])
     t, data = np.array(stamps, dtype=np.int64), np.array(poses)
     if len(t) == 0:
         raise SourceError("holds no poses", where=path)
+    check_padding(texts, path)
     check_growing(path, t, numbers)
     check_unit(path, data[:, q_xyzw], numbers)
     return Trajectory(t, se3.from_quaternion(data[:, :3], data[:, q_xyzw])), behind
@@ -253,7 +267,8 @@ def check_overlap(truth: TruthLog, t_ns: Sequence[int] | Stamps, path: Path, mor
 
 
 def read_imu_csv(path: Path, *, shift_s: float, noise: ImuNoise | None, remark: Callable[[str], None]) -> ImuLog:
-    """EuRoC's ``data.csv``: stamp [ns], gyro xyz [rad/s], accelerometer xyz [m/s^2], in that order.
+    """EuRoC's ``data.csv``: stamp [ns], gyro xyz [rad/s], accelerometer xyz [m/s^2], in that order, as column names on
+    top, if any, must say.
 
     ``shift_s``: ``t_imu = t_cam + shift``, taken off so that the stamps are of the camera's clock. Lines that repeat
     or go back in time are dropped, which ``remark`` is told. Raises SourceError, naming file and line.
@@ -261,6 +276,11 @@ def read_imu_csv(path: Path, *, shift_s: float, noise: ImuNoise | None, remark: 
     stamps: list[int] = []
     rows: list[list[float]] = []
     for number, fields in _fields(path, ","):
+        if not stamps and _are_names(fields):
+            if re.match("lin|acc|a_?(rs_s_)?[xyz]", "".join(fields[1:2]).lower()):
+                cure = "put the columns of the gyroscope before those of the accelerometer"
+                raise SourceError(f"line {number}: '{fields[1]}' comes before the gyroscope", where=path, cure=cure)
+            continue
         try:
             stamps.append(integer_ns(fields[0]))
             rows.append([float(f) for f in fields[1:7]])

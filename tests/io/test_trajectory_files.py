@@ -140,3 +140,32 @@ def test_quaternions_that_are_nearly_unit_are_normalised(tmp_path):
 def test_stamps_keep_their_nanoseconds(text, t_ns):
     assert seconds_text_to_ns(text) == t_ns
     assert seconds_text_to_ns(ns_to_seconds_text(t_ns)) == t_ns
+
+
+@pytest.mark.parametrize("digits", [9, 6, 3])
+@pytest.mark.parametrize("rate_hz", [2.0, 5.0, 30.0])
+def test_fractions_without_their_leading_zeros(tmp_path, digits, rate_hz):
+    """What a program writes that prints whole nanoseconds behind whole seconds; honest ones print fewer digits, too."""
+    unit = 10**digits
+    rng = np.random.default_rng(digits)
+    t = 1_700_000_000 * unit + np.rint((0.0123 + (np.arange(400) + 0.02 * rng.random(400)) / rate_hz) * unit)
+    parts = [divmod(int(k), unit) for k in t]
+    pose = " 0 0 0 0 0 0 1\n"
+    for honest in ([f"{s}.{n:0{digits}d}" for s, n in parts], [f"{s}.{n:0{digits}d}".rstrip("0") for s, n in parts]):
+        (tmp_path / "t.tum").write_text("".join(stamp + pose for stamp in honest))
+        assert len(read_tum(tmp_path / "t.tum")) == 400
+    (tmp_path / "t.tum").write_text("".join(f"{s}.{n}{pose}" for s, n in parts))
+    with pytest.raises(SourceError, match="lack their leading zeros") as caught:
+        read_tum(tmp_path / "t.tum")
+    assert str(caught.value).endswith(f"(write seconds and nanoseconds as %d.%0{digits}d)")
+    assert "\n" not in str(caught.value)
+
+
+def test_times_are_seconds_or_dates(tmp_path):
+    path = tmp_path / "t.txt"
+    path.write_text("# of the left camera\ntimestamps\n2011-09-26 13:02:25.964389445\n2011-09-26T13:02:26Z\n1.5\n")
+    assert read_times(path).tolist() == [1_317_042_145_964_389_445, 1_317_042_146_000_000_000, 1_500_000_000]
+    for line in ("2011-02-30 13:02:25", "2011-09-26", "names below"):
+        path.write_text(f"1.0\n{line}\n")
+        with pytest.raises(SourceError, match=r"t\.txt: line 2: "):
+            read_times(path)
