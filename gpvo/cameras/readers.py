@@ -5,6 +5,7 @@ KITTI odometry's ``calib.txt``.
 
 from __future__ import annotations
 
+import re
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -19,6 +20,17 @@ from gpvo.geometry import se3
 from gpvo.types import Array
 
 _T265_SIZE = (848, 800)
+SIDES = (
+    ("left", "right"),
+    ("cam0", "cam1"),
+    ("fisheye1", "fisheye2"),
+    ("infra1", "infra2"),
+    ("camera0", "camera1"),
+    ("camera_0", "camera_1"),
+    ("cam_0", "cam_1"),
+    ("camera1", "camera2"),
+)
+"""How drivers name the two cameras of one head."""
 # Names under which a calibration lies beside images or a bag, the most telling first.
 CALIBRATION_NAMES = (
     "camchain-imucam.yaml",
@@ -131,13 +143,10 @@ class CameraInfo:
     P: Array
 
 
-_SIDES = (("left", "right"), ("cam0", "cam1"), ("camera0", "camera1"), ("infra1", "infra2"), ("fisheye1", "fisheye2"))
-
-
 def _read_camera_infos(path: Path) -> StereoRig:
     """The rig of ROS camera_info YAML (``camera_calibration_parsers``) for raw images, a file per camera: ``path`` is
     either, ``left.yaml`` or ``right.yaml``, and the other lies beside it."""
-    for left, right in _SIDES:
+    for left, right in SIDES:
         name = path.name.replace(right, left)
         if left in name:
             pair = [path.with_name(name), path.with_name(name.replace(left, right))]
@@ -226,6 +235,11 @@ def read_kitti_calib(path: Path, left: int, right: int, size: tuple[int, int]) -
     P_left, P_right = P[f"P{left}"], P[f"P{right}"]
     if not np.allclose(P_left[:, :3], P_right[:, :3], rtol=1e-6, atol=1e-3):
         raise CalibrationError(f"P{left} and P{right} differ in their intrinsics: not a rectified pair", where=path)
+    number = r"\s+(\d+(?:\.\d+)?(?:e\+?\d\d?)?)"
+    rectified = re.search(rf"^S_rect_0{left}:{number}{number}", calibration_text(path), re.MULTILINE)
+    if rectified and (stated := (round(float(rectified[1])), round(float(rectified[2])))) != size:
+        text = f"is for rectified images of {stated[0]}x{stated[1]}, not {size[0]}x{size[1]}"
+        raise CalibrationError(text, where=path, cure="take the drive's rectified images (_sync)")
     lens = PinholeRadtan(*_of_matrix(P_left), *size)
     if lens.fx_px <= 1:
         raise CalibrationError(f"P{left} has focal length {lens.fx_px:g} px", where=path)

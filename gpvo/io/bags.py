@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 
 from gpvo.cameras.kalibr import camchain_topics
-from gpvo.cameras.readers import CameraInfo, find_calibration, read_stereo_yaml, rig_from_camera_info
+from gpvo.cameras.readers import SIDES, CameraInfo, find_calibration, read_stereo_yaml, rig_from_camera_info
 from gpvo.cameras.rig import StereoRig
 from gpvo.errors import CalibrationError, SourceError
 from gpvo.io.bag_messages import decode_message, encoding_of, imu_topics, pair_streams, read_imu, read_poses
@@ -34,17 +34,6 @@ from gpvo.io.stamps import PAIR_TOLERANCE_S, tolerance_ns, usual_interval
 from gpvo.io.trajectory import MOTION_CAPTURE, UNKNOWN, Trajectory, carry, check_overlap
 from gpvo.types import TruthLog
 
-# How drivers name the two cameras of one head.
-_SIDES = (
-    ("left", "right"),
-    ("cam0", "cam1"),
-    ("fisheye1", "fisheye2"),
-    ("infra1", "infra2"),
-    ("camera0", "camera1"),
-    ("camera_0", "camera_1"),
-    ("cam_0", "cam_1"),
-    ("camera1", "camera2"),
-)
 _CAPTURE_NAMES = ("vicon", "mocap", "optitrack", "vrpn", "qualisys")
 
 
@@ -205,7 +194,7 @@ def _guess_pair(images: list[str], chain: Path | None) -> tuple[str, str] | None
     # The last word that names a side is the camera's; "/left_head/left" may be one of two heads.
     sides = (
         (topic, partner, (k, i))
-        for k, (one, other) in enumerate(_SIDES)
+        for k, (one, other) in enumerate(SIDES)
         for topic in images
         for i, partner in enumerate((other.join(topic.rsplit(one, 1)), topic.replace(one, other)))
     )

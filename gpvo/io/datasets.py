@@ -163,8 +163,15 @@ def _stated_noise(sensor: Path) -> TruthNoise | None:
     return (values[0], values[1]) if len(values) == 2 else None
 
 
+def _folder(path: Path, camera: int) -> Path:
+    """Where the images of a KITTI camera lie: in raw drives, in a folder below that of their stamps."""
+    raw = path / f"image_{camera:02d}" / "data"
+    return raw if raw.is_dir() else path / f"image_{camera}"
+
+
 class KittiSource(FileSource):
-    """A sequence folder with ``image_0 image_1`` (or ``image_2 image_3``), ``calib.txt`` and ``times.txt``.
+    """A sequence folder with ``image_0 image_1`` (or ``image_2 image_3``), ``calib.txt`` and ``times.txt``; or a raw
+    drive with ``image_00/data`` and so on, rectified (``_sync``), and ``calib_cam_to_cam.txt`` there or one up.
 
     The grey pair is taken where it is there. Poses are read from ``poses.txt`` in the folder or
     ``../../poses/NN.txt``. ``calibration``: another ``calib.txt``, or a stereo YAML.
@@ -173,14 +180,18 @@ class KittiSource(FileSource):
     format = "kitti"
 
     def __init__(self, path: Path, *, calibration: str | Path | None = None, **options: Any) -> None:
-        own = path / "calib.txt"
+        raw = (folder / "calib_cam_to_cam.txt" for folder in (path, path.resolve().parent))
+        own = next((c for c in (path / "calib.txt", *raw) if c.is_file()), path / "calib.txt")
         calib = own if calibration is None else Path(calibration)
         if not calib.is_file():
             raise CalibrationError("no calibration", where=calib, cure="copy the sequence's calib.txt there")
         left, right = self._cameras(path)
-        if not (path / "times.txt").is_file():
-            raise SourceError("no time stamps", where=path / "times.txt", cure="one line of seconds per frame")
-        stamps, known = read_times(path / "times.txt"), SourceReport()
+        times = path / f"image_{left:02d}" / "timestamps.txt"
+        if not times.is_file():
+            times = path / "times.txt"
+        if not times.is_file():
+            raise SourceError("no time stamps", where=times, cure="one line of seconds per frame")
+        stamps, known = read_times(times), SourceReport()
         pairs = self._list_pairs(path, stamps, left, right, known)
         first = first_size(pairs, "left")  # the calibration does not say it
         if first is None:
@@ -197,22 +208,22 @@ class KittiSource(FileSource):
         """A folder with KITTI's image folders."""
         return (
             path.is_dir()
-            and any((path / f"image_{a}").is_dir() for a in (0, 2))
-            and ((path / "times.txt").is_file() or (path / "calib.txt").is_file())
+            and any(map(Path.is_dir, (_folder(path, camera) for camera in (0, 2))))
+            and any(f for name in ("times.txt", "calib.txt", "image_0[02]/timestamps.txt") for f in path.glob(name))
         )
 
     @staticmethod
     def _cameras(path: Path) -> tuple[int, int]:
         for left, right in ((0, 1), (2, 3)):
-            if (path / f"image_{left}").is_dir() and (path / f"image_{right}").is_dir():
+            if _folder(path, left).is_dir() and _folder(path, right).is_dir():
                 return left, right
-        cure = "image_0 and image_1 (grey) or image_2 and image_3"
+        cure = "image_0 and image_1 (grey) or image_2 and image_3, of raw drives image_00/data and so on"
         raise SourceError("has no pair of image folders", where=path, cure=cure)
 
     @staticmethod
     def _list_pairs(path: Path, stamps: Stamps, left: int, right: int, known: SourceReport) -> list[PairFiles]:
         """One pair per line of ``times.txt``, named by index; a file without a line is counted, not guessed."""
-        folders = (path / f"image_{left}", path / f"image_{right}")
+        folders = (_folder(path, left), _folder(path, right))
         names: list[dict[int, Path]] = []
         for folder in folders:
             files = (f for f in folder.iterdir() if f.suffix.lower() in IMAGE_SUFFIXES and f.stem.isdecimal())

@@ -157,9 +157,10 @@ def guess(path: str | Path) -> str:
     raise SourceError(
         "not recognised as a stereo sequence",
         where=p,
-        cure="known are EuRoC/ASL (mav0/), KITTI odometry (calib.txt, image_0/), ROS bags (.bag, .db3, .mcap, or a"
-        " folder of those of one recording), image pairs with a camchain.yaml, and tracks (.npz); name one with"
-        " --source; poses alone are for 'gpvo import'",
+        cure="known are EuRoC/ASL (mav0/), KITTI (calib.txt, image_0/, or image_00/data/), ROS bags (.bag, .db3, .mcap,"
+        " or a folder of those of one recording), image pairs with a camchain.yaml (left/ right/, cam0/ cam1/, infra1/"
+        " infra2/, or left, right at one end of the names), and tracks (.npz); name one with --source; poses alone are"
+        " for 'gpvo import'",
     )
 
 

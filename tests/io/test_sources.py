@@ -237,11 +237,69 @@ def test_vicon_marker_and_leica(tmp_path):
 
 
 @pytest.mark.parametrize(
-    ("left", "right"), [("cam0", "cam1"), ("left/data", "right/data"), ("image_left", "image_right")]
+    ("left", "right"),
+    [
+        ("cam0", "cam1"),
+        ("left/data", "right/data"),
+        ("image_left", "image_right"),
+        ("Left", "Right"),
+        ("infra1", "infra2"),
+        ("cam_0", "cam_1"),
+        ("camera0", "camera1"),
+        ("camera1", "camera2"),
+    ],
 )
 def test_folder_names(tmp_path, left, right):
     source = open_source(seq.write_folder(tmp_path / "s", left=left, right=right))
     assert [k for _, k in seq.frames_of(source)] == list(range(12))
+
+
+@pytest.mark.parametrize(
+    "name", ["{1}_{0:04d}", "{1}{0:02d}", "{1}_frame_{0:04d}_color", "{0:04d}{1}", "frame_{0:d}-{1}", "{2}_{0:d}"]
+)
+def test_sides_at_either_end_of_the_names(tmp_path, name):
+    for k in range(12):
+        for side, camera in (("left", "cam0"), ("right", "cam1")):
+            seq.write_image(tmp_path / f"{name.format(k, side, camera)}.png", seq.grey(k))
+    (tmp_path / "camchain.yaml").write_text(seq.camchain_yaml())
+    assert guess(tmp_path) == "folder"
+    assert [k for _, k in seq.frames_of(open_source(tmp_path, rate_hz=20.0))] == list(range(12))
+    (tmp_path / "times.txt").write_text("".join(f"{10 + 0.05 * k:.3f}\n" for k in range(12)))
+    source = open_source(tmp_path, rate_hz=20.0)
+    assert [k for _, k in seq.frames_of(source)] == list(range(12))
+    assert "--rate-hz is not used: the stamps are those of times.txt" in source.report.notes
+
+
+def test_numbers_count_on_although_names_differ_by_side(tmp_path):
+    path = seq.write_folder(tmp_path / "s")
+    for side in ("left", "right"):
+        for k, file in enumerate(sorted((path / side).iterdir())):
+            file.rename(file.with_stem(f"img{side == 'right':d}_{2 * k}"))
+    assert [t for t, _ in seq.frames_of(open_source(path, rate_hz=20.0))] == [100_000_000 * k for k in range(12)]
+
+
+@pytest.mark.parametrize("cameras", [(0, 1), (2, 3)])
+@pytest.mark.parametrize("beside", [True, False])
+def test_raw_drives_of_kitti(tmp_path, cameras, beside):
+    """The calibration is that of the day."""
+    drive = tmp_path / "2011_09_26" / "2011_09_26_drive_0001_sync"
+    seq.write_kitti(drive, folders=[f"image_0{c}/data" for c in cameras], poses=False)
+    text = (drive / "calib.txt").read_text().replace("P", "P_rect_0")
+    size = "".join(f"S_rect_0{c}: {seq.WIDTH:e} {seq.HEIGHT:e}\n" for c in cameras)
+    calib = (drive if beside else drive.parent) / "calib_cam_to_cam.txt"
+    calib.write_text("calib_time: 09-Jan-2012 13:57:47\n" + size + text)
+    for name in ("calib.txt", "times.txt"):
+        (drive / name).unlink()
+    for c in cameras:
+        times = "".join(f"2011-09-26 13:02:{59 + k // 10:02d}.{k % 10}64389445\n" for k in range(10))
+        (drive / f"image_0{c}" / "timestamps.txt").write_text(times + "2011-09-26 13:03:00.5\n2011-09-26 13:03:00.6\n")
+    assert guess(drive) == "kitti"
+    frames = seq.frames_of(open_source(drive))
+    assert [k for _, k in frames] == list(range(12))
+    assert frames[0][0] == 1_317_042_179_064_389_445
+    calib.write_text(calib.read_text().replace("S_rect_00: 6.4", "S_rect_00: 9.2").replace("02: 6.4", "02: 9.2"))
+    with pytest.raises(CalibrationError, match=r"for rectified images of 92x48, not 64x48 .*_sync"):
+        open_source(drive)
 
 
 def test_one_folder_with_sides_and_times(tmp_path):
@@ -281,6 +339,10 @@ def _named(path, name):
             r"not stamps \(dates are not read",
         ),
         (lambda k: f"20240501_12{30 + (k + 10) // 20}{(570 + k) % 600 / 10:09.6f}", r"not stamps \(dates are not read"),
+        (lambda k: f"20231114_2213{20 + k // 10}_{103 * k % 1000:03d}", r"not stamps \(dates are not read"),
+        (lambda k: f"20231114_221320_{10 * k:03d}", r"not stamps \(dates are not read"),
+        (lambda k: f"{1_700_000_000 + k // 10}_{k % 10 * 100}", "not stamps, and there is no"),
+        (lambda k: f"{103 * k - k // 3}", "not stamps, and there is no"),
         (lambda k: f"frame_{k:04d}_v1.2", "not stamps, and there is no"),
         (lambda k: f"frame-{k:04d}-640x480", "not stamps, and there is no"),
     ],
@@ -290,6 +352,7 @@ def test_numbers_in_names_that_are_no_stamps(tmp_path, name, reason):
     with pytest.raises(SourceError, match=reason) as caught:
         open_source(path)
     assert "times.txt" in _one_line(caught)
+    assert "or give --rate-hz" not in _one_line(caught)
     with pytest.raises(SourceError, match="does not count the images") as caught:
         open_source(path, rate_hz=10.0)
     assert name(0) in _one_line(caught)
@@ -297,10 +360,46 @@ def test_numbers_in_names_that_are_no_stamps(tmp_path, name, reason):
     assert [k for _, k in seq.frames_of(open_source(path))] == list(range(30))
 
 
+def test_lines_of_times_by_order_or_by_number(tmp_path):
+    path = _named(tmp_path / "s", lambda k: f"frame_{100 + k}")
+    times = path / "times.txt"
+    times.write_text("time\n" + "".join(f"{10 + 0.1 * k:.3f}\n" for k in range(30)))
+    assert [k for _, k in seq.frames_of(open_source(path))] == list(range(30))
+    times.write_text("".join(f"{10 + 0.1 * k:.3f}\n" for k in range(101)))
+    with pytest.raises(SourceError, match=r"times.txt: holds 101 stamps for 30 images .give a line per pair"):
+        open_source(path)
+    times.write_text("".join(f"{10 + 0.1 * k:.3f}\n" for k in range(110)))
+    source = open_source(path)
+    assert [t for t, _ in seq.frames_of(source)] == [20_000_000_000 + 100_000_000 * k for k in range(10)]
+    assert "20 images without a line in times.txt" in source.report.notes
+
+
 @pytest.mark.parametrize("name", ["{:.6f}", "img_{:.6f}", "cam2_v1.2_{:.6f}"])
 def test_names_in_seconds(tmp_path, name):
     path = _named(tmp_path / "s", lambda k: name.format(1_400_000_000 + 0.1 * k))
+    source = open_source(path, rate_hz=10.0)
+    assert len(seq.frames_of(source)) == 30
+    assert source.report.notes == ["--rate-hz is not used: the stamps are the image names"]
+
+
+def test_names_of_seconds_and_nanoseconds_without_leading_zeros(tmp_path):
+    stamps = [divmod(1_700_000_000_012_345_678 + 103_000_000 * k, 10**9) for k in range(30)]
+    path = _named(tmp_path / "s", lambda k: "{}.{:09d}".format(*stamps[k]))
     assert len(seq.frames_of(open_source(path))) == 30
+    bad = _named(tmp_path / "b", lambda k: "{}.{}".format(*stamps[k]))
+    with pytest.raises(SourceError, match=r"b: the fractions .* lack their leading zeros .*%d\.%09d") as caught:
+        open_source(bad)
+    _one_line(caught)
+
+
+def test_imu_below_a_line_of_names(tmp_path):
+    path = seq.write_folder(tmp_path / "s", 4)
+    rows = "\n".join(f"{t},0.1,0,0,0,0,9.8" for t in seq.stamps(4))
+    (path / "imu.csv").write_text(f"timestamp [ns],w_RS_S_x [rad s^-1],wy,wz,ax,ay,az\n{rows}")
+    assert open_source(path).imu.gyro_radps[0, 0] == 0.1
+    (path / "imu.csv").write_text(f"timestamp,accel_x,accel_y,accel_z,gx,gy,gz\n{rows}")
+    with pytest.raises(SourceError, match="imu.csv: line 1: 'accel_x' comes before the gyroscope .put the columns"):
+        open_source(path)
 
 
 def test_imu_stamps_of_another_unit_are_refused(tmp_path):
