@@ -79,15 +79,17 @@ def read_yaml(path: Path) -> dict[str, Any]:
 
 
 def get_numbers(block: dict[str, Any], key: str, count: int | tuple[int, ...], where: object) -> list[float]:
-    """``block[key]`` as a list of finite numbers of one of the given lengths.
+    """``block[key]``, or the ``data`` of the mapping that it is in OpenCV's JSON, as a list of finite numbers of one of
+    the given lengths.
 
     Raises CalibrationError where the key is absent or holds something else.
     """
     allowed = (count,) if isinstance(count, int) else count
     if key not in block:
         raise CalibrationError(f"lacks the key '{key}'", where=where)
+    held = block[key].get("data", "") if isinstance(block[key], dict) else block[key]
     try:
-        values = np.asarray(block[key], dtype=np.float64).ravel()
+        values = np.asarray(held, dtype=np.float64).ravel()
     except (TypeError, ValueError, OverflowError):
         raise CalibrationError(f"'{key}' is not a list of numbers", where=where) from None
     if len(values) not in allowed or not np.isfinite(values).all():

@@ -31,6 +31,11 @@ SIDES = (
     ("camera1", "camera2"),
 )
 """How drivers name the two cameras of one head."""
+_ALIASES = {
+    f"{other}{k}": f"{own}{k}"
+    for other, own in (("M", "K"), ("cameraMatrix", "K"), ("distCoeffs", "D"))
+    for k in (1, 2)
+}
 # Names under which a calibration lies beside images or a bag, the most telling first.
 CALIBRATION_NAMES = (
     "camchain-imucam.yaml",
@@ -60,7 +65,7 @@ def read_stereo_yaml(path: Path, *, size: tuple[int, int] | None = None) -> Ster
     document = read_yaml(path)
     if "cam0" in document or "cam1" in document:
         return read_camchain(path)
-    if "K1" in document:
+    if not {"K1", "M1", "cameraMatrix1"}.isdisjoint(document):
         return read_opencv_stereo(path, size=size)
     if "camera_matrix" in document:
         return _read_camera_infos(path)
@@ -80,11 +85,12 @@ def find_calibration(folder: Path) -> Path | None:
 def read_opencv_stereo(path: Path, *, size: tuple[int, int] | None = None) -> StereoRig:
     """The rig of an OpenCV stereo file: ``R``, ``T`` map points of the first camera to the second.
 
-    The lens is a fisheye where ``D1`` has exactly four coefficients and the file says ``model: fisheye`` (or names
-    no model and is of a T265), else radial-tangential. ``size`` (width, height) where the file does not say. Raises
-    CalibrationError where a key is missing or the rig impossible.
+    ``K1`` and ``D1`` may be called ``M1`` or ``cameraMatrix1``, and ``distCoeffs1``. The lens is a fisheye where the
+    file says ``model: fisheye``, radial-tangential where it says another or ``D1`` has five coefficients or more; four
+    of no model are those of a fisheye if it is a T265's. ``size`` (width, height) where the file does not say. Raises
+    CalibrationError where a key is missing, four coefficients may be either's, or the rig is impossible.
     """
-    document = read_yaml(path)
+    document = {_ALIASES.get(key, key): value for key, value in read_yaml(path).items()}
     R = np.reshape(get_numbers(document, "R", 9, path), (3, 3))
     T = se3.from_rt(R, np.array(get_numbers(document, "T", 3, path)))
     resolution = _size(document, size, path)
@@ -104,7 +110,8 @@ def _size(document: dict[str, Any], size: tuple[int, int] | None, path: Path) ->
     if "image_width" in document and "image_height" in document:
         return _stated_size(document, path)
     if size is None:
-        raise CalibrationError("does not give the image size", where=path, cure="add the line 'resolution: [848, 800]'")
+        cure = "add the line 'resolution: [WIDTH, HEIGHT]' of your images"
+        raise CalibrationError("does not give the image size", where=path, cure=cure)
     return size
 
 
@@ -118,9 +125,12 @@ def _lens(document: dict[str, Any], index: str, size: tuple[int, int], path: Pat
     D = get_numbers(document, f"D{index}", (4, 5, 8, 12, 14), path)
     named = str(document.get("model", document.get("camera_model", document.get("distortion_model", "")))).lower()
     fisheye = any(word in named for word in ("fisheye", "equidistant", "kannala"))
-    if not named:
+    if not named and len(D) == 4 and any(D):
         # Nothing names the lens: only the T265's own size tells its fisheye from a radial-tangential lens.
-        fisheye = len(D) == 4 and size == _T265_SIZE
+        fisheye = size == _T265_SIZE
+        if not fisheye:
+            text = f"'D{index}' holds four coefficients, of a fisheye (cv2.fisheye) or a radial-tangential lens"
+            raise CalibrationError(text, where=path, cure="add the line 'model: fisheye' or 'model: radtan'")
     model = "equidistant" if fisheye else "radtan"
     return make_lens(model, _of_matrix(K), D, size, path)
 

@@ -246,23 +246,47 @@ def opencv_matrix(name, M) -> str:
     return f"{name}: !!opencv-matrix\n   rows: {M.shape[0]}\n   cols: {M.shape[1]}\n   dt: d\n   data: [ {data} ]\n"
 
 
+def opencv_stereo(K, D, names=("K", "D")) -> str:
+    text = "%YAML:1.0\n---\n" + "".join(opencv_matrix(f"{names[0]}{k}", K) for k in (1, 2))
+    text += "".join(opencv_matrix(f"{names[1]}{k}", D) for k in (1, 2))
+    return text + opencv_matrix("R", T_RIGHT_LEFT[:3, :3]) + opencv_matrix("T", T_RIGHT_LEFT[:3, 3:])
+
+
 def test_t265_opencv_file(write):
     K = np.array([[286.0, 0, 419.0], [0, 286.5, 396.0], [0, 0, 1.0]])
-    D = np.array([-0.003, 0.04, -0.037, 0.006])
-    text = "%YAML:1.0\n---\n" + "".join(opencv_matrix(n, K) for n in ("K1", "K2"))
-    text += "".join(opencv_matrix(n, D) for n in ("D1", "D2"))
-    text += opencv_matrix("R", T_RIGHT_LEFT[:3, :3]) + opencv_matrix("T", T_RIGHT_LEFT[:3, 3:])
+    text = opencv_stereo(K, [-0.003, 0.04, -0.037, 0.006])
     rig = read_opencv_stereo(write(text), size=(848, 800))
     assert isinstance(rig.left, KannalaBrandt)
     np.testing.assert_allclose(rig.T_right_left, T_RIGHT_LEFT, atol=1e-12)
-    with pytest.raises(CalibrationError, match="image size"):
+    with pytest.raises(CalibrationError, match=r"image size .*'resolution: \[WIDTH, HEIGHT\]' of your images"):
         read_stereo_yaml(write(text))
     named = read_stereo_yaml(write(text + "resolution: [640, 480]\nmodel: radtan\n"))
     assert isinstance(named.left, PinholeRadtan)
 
 
-def test_opencv_file_written_by_opencv(tmp_path):
-    path = tmp_path / "stereo.yaml"
+def test_four_coefficients_of_opencv_may_be_of_either_lens(write):
+    K = np.array([[286.0, 0, 319.0], [0, 286.5, 239.0], [0, 0, 1.0]])
+    text = opencv_stereo(K, [-0.003, 0.04, -0.037, 0.006]) + "resolution: [640, 480]\n"
+    with pytest.raises(CalibrationError, match="'D1' holds four .*'model: fisheye' or 'model: radtan'") as caught:
+        read_stereo_yaml(write(text))
+    assert "\n" not in str(caught.value)
+    for line, kind in (("model: fisheye", KannalaBrandt), ("distortion_model: plumb_bob", PinholeRadtan)):
+        assert isinstance(read_stereo_yaml(write(f"{text}{line}\n")).left, kind)
+    for D in ([0.0] * 4, [0.1, 0.0, 0.0, 0.0, 0.0]):
+        assert isinstance(read_opencv_stereo(write(opencv_stereo(K, D)), size=(640, 480)).left, PinholeRadtan)
+
+
+@pytest.mark.parametrize("names", [("M", "D"), ("cameraMatrix", "distCoeffs")])
+def test_other_names_of_opencv(write, names):
+    K = np.array([[286.0, 0, 319.0], [0, 286.5, 239.0], [0, 0, 1.0]])
+    files = [write(opencv_stereo(K, [0.1, 0.0, 0.0, 0.0, 0.0], n), f"{n[0]}.yaml") for n in (("K", "D"), names)]
+    one, other = (read_stereo_yaml(file, size=(640, 480)) for file in files)
+    assert one.describe() == other.describe()
+
+
+@pytest.mark.parametrize("ending", ["yaml", "json"])
+def test_opencv_file_written_by_opencv(tmp_path, ending):
+    path = tmp_path / f"stereo.{ending}"
     storage = cv2.FileStorage(str(path), cv2.FILE_STORAGE_WRITE)
     K = np.array([[450.0, 0, 319.0], [0, 451.0, 239.0], [0, 0, 1.0]])
     for name, M in (("K1", K), ("K2", K), ("D1", np.zeros((1, 5))), ("D2", np.zeros((1, 5)))):
