@@ -66,7 +66,11 @@ _COVARIANCE = re.compile(rf"(?:pose_|position_)?(?:cov|covariance)_({_AXIS})_?({
 _POSED = re.compile(
     r"(?:.*_)?(p|t|pos|position|translation|q|quat|quaternion|ori|orientation|rot|rotation)(?:_rs_r|_rs)?_?([xyzw])"
 )
-_NUMBERED = re.compile(r"(?:.*[_.])?q(?:uat|uaternion)?_?\[?[0-3]\]?", re.IGNORECASE)
+_NUMBERED = re.compile(
+    r"(?:.*[_.])?(?:(?P<q>q(?:uat|uaternion)?_?\[?[0-3]\]?)|p(?:os|osition)?_?\[?[0-2]\]?)", re.IGNORECASE
+)
+_VELOCITY = re.compile(r"(?:.*_)?(?:v_?[xyz]|vel|velocity|twist)(?:_.*|[xyz])?")
+_GEOGRAPHIC = {"lat", "latitude", "lon", "lng", "longitude"}
 _VARIANCE = re.compile(rf"(?:pose_|position_)?(?:var|variance)_({_AXIS})")
 _LENGTHS_M = {"m": 1.0, "mm": 1e-3, "cm": 1e-2, "km": 1e3, "ft": 0.3048}
 _ANGLES_RAD = {"rad": 1.0, "mrad": 1e-3, "deg": np.pi / 180}
@@ -229,16 +233,27 @@ def _targets(path: Path, header: list[str], mapping: Mapping[str, str]) -> dict[
         absent.insert(0, "t_s")
     if absent:
         text = f"no column for {', '.join(absent)} (there are: {', '.join(header)})"
-        cure = f"name it with --map COLUMN={absent[0]}, for ground truth with --truth-map"
-        if {"roll", "pitch", "yaw"} <= {_plain(c).removesuffix("_deg").removesuffix("_rad") for c in header}:
-            cure = _ANGLES
-        elif len(q := [c for c in header if _NUMBERED.fullmatch(c)]) == 4:
-            named = " ".join(f"--map '{c}={name}'" for c, name in zip(q, ("q_w", "q_x", "q_y", "q_z")))
-            cure = f"numbers do not tell which is w: if the first, as in PX4's logs, give {named}"
-        elif absent == list(_POSE[3:]):
-            cure += f"; {POSITIONS_ALONE}"
-        raise SourceError(text, where=path, cure=cure)
+        raise SourceError(text, where=path, cure=_cure_of_absent(absent, [c for c in header if c not in mapping]))
     return found
+
+
+def _cure_of_absent(absent: list[str], columns: list[str]) -> str:
+    """What to do about targets without a column, by the names of those that are not mapped."""
+    cure = f"name it with --map COLUMN={absent[0]}, for ground truth with --truth-map"
+    plain, numbered = {_plain(c) for c in columns}, {c: m for c in columns if (m := _NUMBERED.fullmatch(c))}
+    q, p = ([c for c, m in numbered.items() if bool(m["q"]) == of_q] for of_q in (True, False))
+    q, p = q if len(q) == 4 and "q_x" in absent else [], p if len(p) == 3 and "p_x" in absent else []
+    if {"roll", "pitch", "yaw"} <= {c.removesuffix("_deg").removesuffix("_rad") for c in plain}:
+        return _ANGLES
+    if q or p:
+        names = zip([*q, *p], [*(("q_w", "q_x", "q_y", "q_z") if q else ()), *_POSE[:3]])
+        given = "give " + " ".join(f"--map '{c}={name}'" for c, name in names)
+        return f"numbers do not tell which is w: if the first, as in PX4's logs, {given}" if q else given
+    if not plain.isdisjoint(_GEOGRAPHIC) and "p_x" in absent:
+        return "convert latitude and longitude to metres, x to the east and y to the north of the start"
+    if any(map(_VELOCITY.fullmatch, plain)) and {*_POSE[:3]} <= {*absent}:
+        return f"velocities alone are not read: integrate them to poses, or, if there are positions, {cure}"
+    return f"{cure}; {POSITIONS_ALONE}" if absent == list(_POSE[3:]) else cure
 
 
 def _is_plain(column: str) -> bool:

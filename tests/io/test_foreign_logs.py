@@ -380,6 +380,13 @@ def test_covariance_follows_the_frame(tmp_path):
         ("1,0,0,0,0,0,0,1\n", "no header line"),
         ("t,gt_p_x,vo_p_x\n1,0,0\n", "'gt_p_x' and 'vo_p_x' may both be p_x .say which with --map COLUMN=p_x"),
         ("1 2 3\n", "not look like a trajectory"),
+        ("t,vx,vy,vz\n1,0,0,0\n", "velocities alone are not read: integrate them to poses"),
+        ("t,twist.twist.linear.x,twist.twist.linear.y\n1,0,0\n", "velocities alone are not read"),
+        ("t,latitude,longitude,altitude,qx,qy,qz,qw\n1,48,11,0,0,0,0,1\n", "convert latitude and longitude to metres"),
+        (
+            "t," + ",".join(f"position[{k}]" for k in range(3)) + ",qx,qy,qz,qw\n",
+            r"give --map 'position\[0\]=p_x' --map",
+        ),
     ],
 )
 def test_bad_logs_in_one_line(tmp_path, text, reason):
