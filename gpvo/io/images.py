@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from gpvo.cameras.imagesize import decoded, image_size
 from gpvo.cameras.models import CameraModel
 from gpvo.cameras.rectify import Rectifier, read_mask
-from gpvo.cameras.rig import StereoRig
+from gpvo.cameras.rig import LONG_BASELINE_M, StereoRig
 from gpvo.errors import CalibrationError, SourceError
 from gpvo.io.source import Depth, SourceReport
 from gpvo.io.stamps import check_interval, in_order, usual_interval
@@ -127,6 +127,8 @@ class ImageSource(ABC):
         self.imu: ImuLog | None = None
         self.truth: TruthLog | None = None
         self.known = SourceReport() if known is None else known
+        if rig.baseline_m > LONG_BASELINE_M:
+            self.known.note(f"baseline {rig.baseline_m:.2f} m: are the translations in metres?")
         self.report = self._fresh_report()
         R_rect_left = self.rectifier.R_rect_left.tolist()
         self.calibration: dict[str, Any] | None = {**rig.describe(), "R_rect_left": R_rect_left}

@@ -77,6 +77,7 @@ class StereoOdometry:
         self._sigmas = SigmaEstimator(self.config.sigma_p_px, self.config.sigma_m_px)
         self._noise = NoiseEstimator()
         self._state: State | None = None
+        self._t_last_ns: tuple[int, ...] = ()
         self._imu = ImuMoments.of(None)  # since the reference
         self.pair = PairWatch(camera)
         self._raw = EMPTY  # the last matches as measured
@@ -87,10 +88,12 @@ class StereoOdometry:
 
         ``imu`` holds the samples since the last frame, if any. The record gets the mean and spread of all samples since
         the reference, so that they cover the same interval as its motion. Raises SourceError if the frame is not later
-        than the last one, its stamp no whole number, or its images not of the camera's size. The images are copied.
+        than the last one, its stamp no whole number of nanoseconds, or its images not of the camera's size. The images
+        are copied.
         """
         clock = Stopwatch()
-        frame = own_frame(frame, self.camera, None if self._state is None else self._state.t_last_ns)
+        frame = own_frame(frame, self.camera, self._t_last_ns)
+        self._t_last_ns = (*self._t_last_ns[-1:], frame.t_ns)
         frontend = self._frontend = self._frontend or self._new_frontend(frame)
         seen = frontend.observe(frame, stays=self._state is not None and self._state.stays(self.config))
         clock.lap("observe")

@@ -20,6 +20,7 @@ from gpvo.vo.rivals import Choice, Expected, Leaps
 
 _GUESS_S = 0.5  # for so long a velocity is taken to last
 _SIGMAS_WITHIN_REACH = 5.0  # of what a vehicle can do
+_TOO_FAST_NS = 200_000  # for three frames: by arrival, two may come at once
 _SUSPICION_NS = 10 * 10**9  # and a motion that was refused may come back
 
 
@@ -204,17 +205,24 @@ class Stopwatch:
         self._since = now
 
 
-def own_frame(frame: StereoFrame | TrackFrame, camera: StereoCamera, t_last_ns: int | None) -> StereoFrame | TrackFrame:
-    """The frame with images of its own, as its giver may write the next pair into the same memory.
+def own_frame(
+    frame: StereoFrame | TrackFrame, camera: StereoCamera, t_last_ns: tuple[int, ...]
+) -> StereoFrame | TrackFrame:
+    """The frame with images of its own, as its giver may write the next pair into the same memory; ``t_last_ns``: the
+    stamps of the last two frames.
 
-    Raises SourceError for a stamp that is no whole number or not later than the last, and for images of another size.
+    Raises SourceError for a stamp that is no whole number, not later than the last or the third within 0.2 ms, and for
+    images of another size.
     """
     if not isinstance(frame.t_ns, int | np.integer):
         cure = "give whole nanoseconds: round(1e9 * seconds)"
         raise SourceError(f"the frame's t_ns is {frame.t_ns!r}, no whole number", cure=cure)
-    if t_last_ns is not None and frame.t_ns <= t_last_ns:
+    if t_last_ns and frame.t_ns <= t_last_ns[-1]:
         cure = "feed frames in time order"
-        raise SourceError(f"frame at t_ns={frame.t_ns} is not later than the one before ({t_last_ns})", cure=cure)
+        raise SourceError(f"frame at t_ns={frame.t_ns} is not later than the one before ({t_last_ns[-1]})", cure=cure)
+    if len(t_last_ns) == 2 and frame.t_ns - t_last_ns[0] <= _TOO_FAST_NS:
+        cure = "give whole nanoseconds, not seconds, ms or us: round(1e9 * seconds)"
+        raise SourceError(f"frames at t_ns={t_last_ns[0]}, {t_last_ns[1]}, {frame.t_ns} follow too fast", cure=cure)
     if isinstance(frame, TrackFrame):
         return replace(frame, t_ns=int(frame.t_ns))
     for side, image in (("left", frame.left), ("right", frame.right)):

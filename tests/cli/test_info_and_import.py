@@ -364,3 +364,12 @@ def test_what_a_corrected_calibration_leaves(tmp_path, term, told):
         code, out, err = gpvo("calibration", tmp_path / "r", "-o", tmp_path / "c.yaml")
         assert code == 0
         assert text in out + err
+
+
+def test_a_baseline_of_decimetres_is_told(tmp_path):
+    path = seq.write_folder(tmp_path / "s")
+    chain = path / "camchain.yaml"
+    chain.write_text(chain.read_text().replace("[1.0, 0.0, 0.0, -0.1]", "[1.0, 0.0, 0.0, -5.37]"))
+    code, out, _ = gpvo("info", path)
+    assert code == 0
+    assert "notes: baseline 5.37 m: are the translations in metres?" in out

@@ -137,7 +137,16 @@ def test_one_missing_input_that_training_never_missed_is_not_in_the_domain(missi
 
 @pytest.mark.parametrize(
     "change",
-    [{"baseline_m": -0.1}, {"width": 1e-320}, {"fx_px": np.nan}, {"width": 0}, {"cx_px": np.inf}, {"fy_px": "1"}],
+    [
+        {"baseline_m": -0.1},
+        {"baseline_m": 110.0},
+        {"baseline_m": 1e-4},
+        {"width": 1e-320},
+        {"fx_px": np.nan},
+        {"width": 0},
+        {"cx_px": np.inf},
+        {"fy_px": "1"},
+    ],
 )
 def test_a_camera_that_cannot_be_is_refused(change: dict) -> None:
     good = {**vars(CAMERA)}

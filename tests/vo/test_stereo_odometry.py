@@ -205,6 +205,12 @@ def test_refuses_what_it_cannot_mean(clip: Clip) -> None:
     seconds = replace(clip.frames[1], t_ns=clip.frames[1].t_ns * 1e-9)  # type: ignore[arg-type]
     with pytest.raises(SourceError, match=r"no whole number \(give whole nanoseconds"):
         odometry.step(seconds)
+    for per_s in (1, 1000, 10**6):  # two frames by arrival may come at once
+        in_another_unit, step = StereoOdometry(clip.camera), round(0.05 * per_s) or 1
+        for k in range(2):
+            in_another_unit.step(replace(clip.frames[k], t_ns=10**9 * per_s + k * step))
+        with pytest.raises(SourceError, match=r"follow too fast \(give whole nanoseconds, not seconds, ms or us"):
+            in_another_unit.step(replace(clip.frames[2], t_ns=10**9 * per_s + 2 * step))
     with pytest.raises(CalibrationError, match="rows before columns"):
         StereoOdometry(clip.camera, mask=np.ones((clip.camera.width, clip.camera.height), bool))
     for wrong in ({"preset": "best"}, {"nonsense": 1}, {"methods": ("magic",)}, {"sigma_px": -1.0}):
