@@ -17,7 +17,7 @@ from gpvo.errors import GpvoError, SourceError, counted
 from gpvo.files import in_metres, plain, read_toml, write_json
 from gpvo.io.run import RunWriter, as_stored
 from gpvo.io.snapshot import digest_of
-from gpvo.types import ImuLog, Prediction, Status, StereoFrame, TrackFrame, VoRecord
+from gpvo.types import ImuLog, Prediction, Status, StereoFrame, TrackFrame, VoRecord, frequent_reasons
 from gpvo.vo.config import VoConfig, make_config
 from gpvo.vo.frontend import Followed, TrackRecorder
 from gpvo.vo.odometry import StereoOdometry
@@ -42,6 +42,7 @@ class RunSummary:
     frames_per_s: float
     source_report: str
     calibration: list[str] = field(default_factory=list)  # what it has wrong
+    reasons: list[str] = field(default_factory=list)  # why motions are not ok, if many are not
 
     def __str__(self) -> str:
         named = ((s.value, self.status.get(s.value, 0)) for s in Status if s is not Status.START)
@@ -82,7 +83,7 @@ def run(
     if predictor is not None:
         known["model_digest"] = predictor.digest
         predictor.reset(source.camera, vehicle=config.vehicle)
-    status: Counter[str] = Counter()
+    status, reasons = Counter[str](), list[str]()
     length_m = busy_s = 0.0
     recorder = TrackRecorder() if keep_tracks else None
     odometry = StereoOdometry(source.camera, config, source.mask, calibration_state, source.mounting.T_imu_cam)
@@ -114,6 +115,7 @@ def run(
             tracks = None if recorder is None or k < len(done) else recorder.step(record, step.followed)
             writer.append(record, prediction, tracks, (odometry, recorder))
             status[record.status.value] += 1
+            reasons.append(record.reason)
             length_m += float(np.linalg.norm(record.T_prev_cur[:3, 3])) if record.is_reference else 0.0
             busy_s += step.seconds
             if on_frame is not None:
@@ -124,7 +126,10 @@ def run(
         state = odometry.rig_error.state
         write_json(writer.path / STATE_FILE, document(state, source.camera, calibration_state))
         wrong = findings(state, source.camera)
-        summary = RunSummary(frames, dict(status), length_m, frames / max(busy_s, 1e-9), str(source.report), wrong)
+        summary = RunSummary(
+            frames, dict(status), length_m, frames / max(busy_s, 1e-9), str(source.report), wrong,
+            frequent_reasons(reasons),
+        )  # fmt: skip
         writer.note(source_report=asdict(source.report), summary=asdict(summary))
     return summary
 

@@ -16,6 +16,7 @@ from gpvo.io.run import read_run
 from gpvo.io.run_read import is_run
 from gpvo.io.source import existing, guess, open_source
 from gpvo.io.trajectory import read_kitti_poses
+from gpvo.types import frequent_reasons
 
 _HEAD = 100_000
 
@@ -93,6 +94,7 @@ def _run(path: Path) -> dict[str, Any]:
         "source": run.meta.get("source"),
         "frames": len(log),
         "statuses": {s: int(n) for s, n in zip(*np.unique([s.value for s in log.statuses], return_counts=True))},
+        "not_ok": frequent_reasons(log.column("reason").tolist()),
         "methods": list(log.methods),
         "camera": None if log.camera is None else log.camera.__dict__,
         "odometry": _poses(log.t_ns, log.trajectory()),

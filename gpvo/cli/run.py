@@ -15,12 +15,13 @@ from gpvo.files import read_json, write_text
 from gpvo.io.run import read_run
 from gpvo.io.source import open_source
 from gpvo.online.predictor import Predictor
-from gpvo.types import Prediction
+from gpvo.types import Prediction, Status
 
 if TYPE_CHECKING:
     from gpvo.runner import RunSummary
 
 _MOST_NOTES = 5
+_MOST_LOST = 0.5
 _MUCH_LEFT = 1 / 3  # of a displacement: with 0.4 left, drive 0001 of KITTI drifts twice as far
 
 
@@ -86,6 +87,8 @@ def _tell(out: Path, summary: RunSummary, notes: Sequence[str], json_: bool) -> 
         print_json({"schema": 1, "run": str(out), **summary.__dict__})
     else:
         print(f"{out}: {summary}")
+        if summary.reasons:
+            print(f"not ok: {'; '.join(summary.reasons)}")
         if summary.source_report != counted(summary.frames, "frame"):
             print(f"source: {summary.source_report}")
         for line in summary.calibration:
@@ -107,8 +110,8 @@ def calibration(
     """
     from gpvo.vo.rig_findings import CAMCHAIN, camchain, corrected, document, explained_px, read_state, rig_of
 
-    camera = read_run(run).log.camera
-    if camera is None:
+    log = read_run(run).log
+    if (camera := log.camera) is None:
         raise SourceError("holds no camera: it was not made by gpvo run", where=run)
     state = read_state(run, camera)
     found = document(state, camera)
@@ -119,7 +122,10 @@ def calibration(
     if json_:
         print_json({"run": str(run), **found, "found_px": found_px, "unexplained_px": left_px})
         return
-    print("\n".join(found["findings"] or ["no calibration error was found between the cameras"]))
+    none = "no calibration error was found between the cameras"
+    if (lost := log.statuses.count(Status.LOST)) > _MOST_LOST * len(log):
+        none = f"too few motions tell: {lost} of {len(log)} are lost; is the calibration of these images?"
+    print("\n".join(found["findings"] or [none]))
     if out is not None and not found["findings"]:
         print(f"{out}: the calibration, unchanged")
     elif out is not None:

@@ -16,6 +16,7 @@ from gpvo.types.records import (
     StoredRecords,
     VoLog,
     VoRecord,
+    frequent_reasons,
 )
 from gpvo.types.sensors import (
     MOST_MPS2,
@@ -67,6 +68,7 @@ __all__ = [
     "VoLog",
     "VoRecord",
     "field_names",
+    "frequent_reasons",
     "out_of_limits",
     "within",
 ]

@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import math
+import re
 from abc import ABC, abstractmethod
+from collections import Counter
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, fields, replace
 from enum import Enum
@@ -14,6 +16,7 @@ from numpy.typing import NDArray
 
 from gpvo.types.sensors import VEHICLES, Array, ImuLog, StereoCamera, Vehicle, field_names
 
+_NUMBER = r"-?\d+(?:\.\d+)?(?:e[+-]?\d+)?"
 _Item = TypeVar("_Item")
 _Rows = TypeVar("_Rows", bound="Columns[Any]")
 
@@ -108,6 +111,14 @@ class VoRecord:
         if status.severity <= self.status.severity:
             return self
         return replace(self, status=status, reason="; ".join(filter(None, (self.reason, reason))))
+
+
+def frequent_reasons(reasons: Sequence[str]) -> list[str]:
+    """The three most frequent of the reasons of motions, empty for ``ok`` ones, each with its count, where more than a
+    twentieth have any; their numbers are left out."""
+    count = Counter(part for reason in reasons for part in {*re.sub(_NUMBER, "N", reason).split("; ")} if part)
+    is_worth = sum(map(bool, reasons)) > 0.05 * len(reasons)
+    return [f"{reason} ({n})" for reason, n in count.most_common(3)] if is_worth else []
 
 
 class Columns(Sequence[_Item], ABC):

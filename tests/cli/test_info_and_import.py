@@ -366,6 +366,18 @@ def test_what_a_corrected_calibration_leaves(tmp_path, term, told):
         assert text in out + err
 
 
+def test_a_run_that_is_mostly_lost_has_not_shown_its_calibration(tmp_path):
+    camera = StereoCamera(380.0, 380.0, 319.5, 239.5, 0.12, 640, 480)
+    records = [VoRecord(0, 0, Status.START, np.eye(4))]
+    records += [VoRecord(k, 0, Status.LOST, np.eye(4), reason=f"only {k} of 99 points agree") for k in range(1, 10)]
+    write_run(tmp_path / "r", VoLog(records, camera=camera))
+    state = RigState(np.zeros(30), 1e-6 * np.eye(30), 1.0)
+    write_json(tmp_path / "r" / "calibration_state.json", document(state, camera))
+    code, out, _ = gpvo("calibration", tmp_path / "r")
+    assert (code, out) == (0, "too few motions tell: 9 of 10 are lost; is the calibration of these images?\n")
+    assert "not_ok: only N of N points agree (9)" in gpvo("info", tmp_path / "r")[1]
+
+
 def test_a_baseline_of_decimetres_is_told(tmp_path):
     path = seq.write_folder(tmp_path / "s")
     chain = path / "camchain.yaml"

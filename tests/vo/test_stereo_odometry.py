@@ -12,7 +12,7 @@ from gpvo.errors import CalibrationError, GpvoError, SourceError
 from gpvo.geometry import se3
 from gpvo.runner import RunSummary
 from gpvo.sim.points import simulate_points
-from gpvo.types import ImuLog, Status, StereoFrame, TrackFrame, VoLog, VoRecord
+from gpvo.types import ImuLog, Status, StereoFrame, TrackFrame, VoLog, VoRecord, frequent_reasons
 from gpvo.vo.config import make_config, read_settings
 from gpvo.vo.odometry import StereoOdometry
 
@@ -274,3 +274,11 @@ def test_sigmas_follow_the_residuals(clip: Clip) -> None:
 @pytest.mark.parametrize("length_m, told", [(0.0196, "0.0196 m"), (31.04, "31.0 m")])
 def test_a_short_path_is_not_called_none(length_m: float, told: str) -> None:
     assert told in str(RunSummary(61, {}, length_m, 12.0, ""))
+
+
+def test_the_reasons_of_many_motions_are_told_without_their_numbers() -> None:
+    few = [f"only {k} of {2 * k} points agree; translation uncertain by 1.{k}e-05 m" for k in range(9, 12)]
+    frozen = ["frozen image"] * 2
+    told = ["only N of N points agree (3)", "translation uncertain by N m (3)", "frozen image (2)"]
+    assert sorted(frequent_reasons([*few, *frozen, "", "dark"])) == sorted(told)
+    assert frequent_reasons([*few, *[""] * 57]) == []

@@ -269,6 +269,13 @@ def test_wrong_partners_speak_louder_than_missing_ones() -> None:
         assert watch.findings() == []  # most points are well
 
 
+def test_points_without_a_partner_may_speak_of_another_calibration() -> None:
+    watch = PairWatch(pinhole(480, 360))
+    for _ in range(9):
+        watch.step(Observation(None, False), RightSearch(100, 30, 0, 5, np.zeros(0), np.zeros(0)))
+    assert "whether the calibration is of these images" in watch.findings()[0]
+
+
 def test_points_beyond_the_right_image_are_not_missing() -> None:
     """A wall so near that the right camera sees four fifths of what the left one does; nothing else is wrong."""
     camera, rng = pinhole(480, 360), np.random.default_rng(0)
