@@ -30,7 +30,7 @@ from gpvo.vo.quality import (
     worst_translation_sigma_m,
 )
 from gpvo.vo.rig_error import RigError, RigState
-from gpvo.vo.rivals import Choice, areas, choose, unexplained, untangled
+from gpvo.vo.rivals import Choice, areas, choose, explained, unexplained, untangled
 from gpvo.vo.state import State, Stopwatch, own_frame
 from gpvo.vo.window import Window
 
@@ -181,7 +181,8 @@ class StereoOdometry:
         """The motion freed from points that do not move with the scene, or its rival among the points that disagree: a
         second one is added to the doubts, and so is a motion that the vehicle cannot make."""
         assert self._state is not None
-        self._state.rival = None
+        state = self._state
+        state.rival = None
         if motion is None:
             return None, Choice()
         motion, held = untangled(motion, matches, self.camera, self._estimate)
@@ -189,34 +190,36 @@ class StereoOdometry:
         free = unexplained(motion, matches, self.camera, self.config)
         second = None if free is None else self._estimate(matches, free)
         covered = (1, 0) if second is None else areas(motion, second, matches, self.camera, self.config)
-        self._state.rivalry = _RIVAL_STAYS * self._state.rivalry + float(covered[1] > 0)
+        state.rivalry = _RIVAL_STAYS * state.rivalry + float(covered[1] > 0)
         motions = [motion]
         if second is not None and covered[1] > 0:
-            self._state.rival = motion.inliers | second.inliers
+            state.rival = motion.inliers | second.inliers
             motions.append(second)
             doubts.append(f"two motions, over {covered[0]} and {covered[1]} parts of the image")
-        elif self._state.rivalry > 1.5:
+        elif state.rivalry > 1.5:
             doubts.append("two motions in the frames before")
-        expected = self._state.expected(t_ns, guess, self.config.max_acceleration_mps2)
-        chosen = choose(motions, covered, expected)
+        expected = state.expected(t_ns, guess, self.config.max_acceleration_mps2)
+        shares = [explained(m, matches, self.camera, self.config) for m in motions]
+        chosen = choose(motions, covered, expected, lambda i, on: state.unseen(shares[i], expected, goes_on=on))
         if len(motions) == 1 and chosen.plausible:  # a rival that is not found in one frame has not gone
-            chosen = replace(chosen, otherwise=_RIVAL_STAYS * self._state.in_doubt)
-        self._state.odds, self._state.in_doubt = chosen.odds, chosen.otherwise
+            chosen = replace(chosen, otherwise=_RIVAL_STAYS * state.in_doubt)
+        state.odds, state.in_doubt = chosen.odds, chosen.otherwise
         T_ref_cur = motions[chosen.index].T_prev_cur
         if not chosen.plausible:
-            self._state.refuse(t_ns, T_ref_cur)
+            state.refuse(t_ns, T_ref_cur)
             is_felt = expected is not None and expected.felt
-            reason = (
-                "the IMU felt no such change of velocity" if is_felt else "no vehicle changes its velocity like this"
-            )
-            doubts.append(reason)
+            says = "the IMU felt no such change of velocity", "no vehicle changes its velocity like this"
+            doubts.append(says[0] if is_felt else says[1])
         elif chosen.tells and not chosen.goes_on:
-            self._state.leap(t_ns, T_ref_cur, self.config.max_acceleration_mps2)
+            state.leap(t_ns, T_ref_cur, self.config.max_acceleration_mps2)
         elif chosen.tells:
-            self._state.compare(t_ns, T_ref_cur)
-        left = self._state.otherwise(t_ns, T_ref_cur, self.config.max_acceleration_mps2)
+            state.compare(t_ns, T_ref_cur)
+        if chosen.plausible:
+            unseen = state.follow(t_ns, T_ref_cur, shares[chosen.index], expected, goes_on=chosen.goes_on)
+            chosen = replace(chosen, otherwise=chosen.otherwise + unseen)
+        left = state.otherwise(t_ns, T_ref_cur, self.config.max_acceleration_mps2)
         if left is not None:
-            doubts.append(self._state.leaps.reason)
+            doubts.append(state.leaps.reason)
             chosen = replace(chosen, otherwise=chosen.otherwise + left)
         return motions[chosen.index], chosen
 

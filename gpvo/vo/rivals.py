@@ -23,13 +23,14 @@ from gpvo.vo.motion import Motion, predict_uvd
 from gpvo.vo.quality import worst_translation_sigma_m
 
 _CELLS = 96  # of the whole image
-_EXPLAINED = 0.8  # share of the cells; below, a rival is looked for
+EXPLAINED = 0.8  # share of the cells; below, a rival is looked for
 _LEAST = 8  # points: a motion through any three is found by chance, a tight one through eight is not
 _STILL_PX = 0.5  # change of a measurement by noise alone
 _SHARE = 1 / 8  # of the other's cells: a motion seen over less is that of an object
 _NOISE = 9.0  # standard deviations of odometry's own noise that are no change of velocity
 _AREA = 0.5  # power of the parts covered in the odds of being the scene, frame by frame: neighbours tell the same
 _UNSEEN = -0.2  # log odds of the expected motion that nothing in the image makes
+_REMEMBERED_S = 4.0  # for so long the parts that a motion explained speak for it
 _SUREST = 3.0  # log odds at most: whoever is surer could not be put right
 _LONGEST_DOUBT_NS = 30 * 10**9
 _REGAINED = 0.3  # log odds, with each frame in which nothing speaks against the motion
@@ -107,31 +108,81 @@ class Leaps:
         return self.before
 
 
-def choose(motions: Sequence[Motion], covered: Sequence[int], expected: Expected | None) -> Choice:
+@dataclass
+class Standing:
+    """How surely the motion that is followed is that of the scene: by the parts of the image that it explains, now and
+    over the last seconds.
+
+    Where a motion explains a share s of the parts, s / (1 - s) are its odds by this frame; what the frames before said
+    is averaged, as neighbours tell the same. That both count once is right on flights through simulated traffic, where
+    areas and velocities, by which the motion is chosen, tell next to nothing of whether the choice was right
+    (:doc:`/failures`).
+    """
+
+    before: float | None = None  # log odds by the frames before; None at the beginning of a motion
+    mean: Array = field(default_factory=lambda: np.zeros(6))  # of the velocities followed so far, per second
+    square: Array = field(default_factory=lambda: np.diag([1.0] * 3 + [0.25] * 3))  # mean of their outer products
+    age_s: float = 1.0
+
+    def wrong(self, share: float, *, goes_on: bool, felt: bool) -> float:
+        """Probability that a motion that explains this share is not that of the scene; ``felt``: an IMU says it is."""
+        now = _log_odds(share)
+        before = self.before if goes_on and self.before is not None else now
+        return float(1 / (1 + np.exp(now + before + _SUREST * felt)))
+
+    def unseen(self, twist: Array) -> Array:
+        """Second moment (6, 6) about a velocity (6,) of those that the vehicle has had: it may have any of them where
+        nothing in the image shows the scene."""
+        cross = np.outer(self.mean, twist)
+        return np.asarray(self.square - cross - cross.T + np.outer(twist, twist))
+
+    def follow(self, share: float, twist: Array, dt_s: float, *, goes_on: bool) -> None:
+        """A motion with this velocity (6,), over so long a time, that explains this share of the parts is taken."""
+        now, keep = _log_odds(share), np.exp(-dt_s / _REMEMBERED_S)
+        self.before = keep * self.before + (1 - keep) * now if goes_on and self.before is not None else now
+        self.age_s += dt_s
+        self.mean = self.mean + dt_s / self.age_s * (twist - self.mean)
+        self.square = self.square + dt_s / self.age_s * (np.outer(twist, twist) - self.square)
+
+
+def _log_odds(share: float) -> float:
+    p = min(max(share, 0.03), 0.97)  # of a few dozen parts
+    return float(np.log(p / (1 - p)))
+
+
+def choose(
+    motions: Sequence[Motion],
+    covered: Sequence[int],
+    expected: Expected | None,
+    wrong: Callable[[int, bool], float] = lambda index, goes_on: 0.0,
+) -> Choice:
     """The likeliest of the motions to be the scene's: the one that goes on as expected, until the parts of the image
     have spoken long enough for another. Where none goes on, what was expected is a candidate of its own.
 
-    Moments of the mixture: ``sum p_i (d_i d_i^T + C_i)``, with d_i from the chosen motion to another, and C_i of what
-    was expected alone.
+    Moments of the mixture: ``sum p_i (d_i d_i^T + C_i)``, with d_i from the chosen motion to another, and C_i of the
+    other's translation. ``wrong(index, goes_on)``: probability that another is the scene's, however likely this one is.
     """
     weight, goes_on, tells, back = _weigh(motions, covered, expected)
-    candidates = [m.T_prev_cur for m in motions]
+    candidates, sigma_m = [m.T_prev_cur for m in motions], [worst_translation_sigma_m(m) for m in motions]
     if len(weight) > len(motions) and expected is not None:
         candidates.append(expected.T_prev_cur)
+        sigma_m.append(expected.sigma_m)
     best, likeliest = int(np.argmax(weight[: len(motions)])), int(np.argmax(weight))
     plausible = best == likeliest
     if len(candidates) > 1:
         odds = float(weight[likeliest] - np.delete(weight, likeliest).max())
     else:
         odds = (0.0 if expected is None else expected.odds) + _REGAINED
+    on = bool(goes_on[best] and not back[best])
     share = np.exp(weight - weight.max())
-    # However often the same was seen, it may be wrong.
-    share = np.maximum(share / share.sum(), np.exp(-_SUREST) / (1 + np.exp(-_SUREST)))
+    share /= share.sum()
+    others = 1.0 - share[best]
+    if others > 0.0:  # however often the same was seen, it may be wrong
+        share *= max(others, wrong(best, on)) / others
+    share[best] = 0.0
     d = np.stack([se3.log(se3.inverse(candidates[best]) @ T) for T in candidates])
     otherwise = np.einsum("i,ij,ik->jk", share, d, d)
-    if len(candidates) > len(motions) and expected is not None:
-        otherwise[:3, :3] += share[-1] * expected.sigma_m**2 * np.eye(3)
-    on = bool(goes_on[best] and not back[best])
+    otherwise[:3, :3] += share @ np.square(np.where(np.isfinite(sigma_m), sigma_m, 0.0)) * np.eye(3)
     return Choice(best, otherwise, plausible, plausible and bool(tells[best]), min(odds, _SUREST), on)
 
 
@@ -184,13 +235,20 @@ def cells(uv: NDArray[np.floating[Any]], camera: StereoCamera) -> NDArray[np.int
 
 
 def unexplained(motion: Motion, matches: Matches, camera: StereoCamera, config: VoConfig) -> NDArray[np.bool_] | None:
-    """(N,) the points, spare ones too, that moved otherwise; None where the motion explains most of the image.
+    """(N,) the points, spare ones too, that moved otherwise; None where the motion explains most of the image."""
+    off_px = _off_px(motion.T_prev_cur, matches, camera)
+    free = (matches.uvd_prev[:, 2] > KNOWN_DEPTH_PX) & (off_px > max(config.ransac_threshold_px, 6 * motion.scale_px))
+    return free if free.sum() >= _LEAST and explained(motion, matches, camera, config) < EXPLAINED else None
 
-    That is the share of the cells with points of the reference, but for those that the motion puts out of sight, in
-    which one agrees. Points at infinity do not count: they agree with any translation.
+
+def explained(motion: Motion, matches: Matches, camera: StereoCamera, config: VoConfig) -> float:
+    """Share of the cells with points of the reference, but for those that the motion puts out of sight, in which one
+    agrees; 1 where they are not known.
+
+    Points at infinity do not count: they agree with any translation.
     """
     if matches.sought_uvd is None:
-        return None
+        return 1.0
     off_px = _off_px(motion.T_prev_cur, matches, camera)
     (u, v, d), in_front = predict_uvd(motion.T_prev_cur, matches.sought_uvd, camera)
     margin = config.klt_window_px
@@ -198,8 +256,7 @@ def unexplained(motion: Motion, matches: Matches, camera: StereoCamera, config: 
     tells, told = (uvd[:, 2] > KNOWN_DEPTH_PX for uvd in (matches.sought_uvd, matches.uvd_prev))
     sought = np.unique(cells(matches.sought_uvd[in_front & inside & tells], camera))
     agree = np.isin(sought, cells(matches.uvd_prev[(off_px < config.ransac_threshold_px) & told], camera))
-    free = told & (off_px > max(config.ransac_threshold_px, 6 * motion.scale_px))
-    return free if free.sum() >= _LEAST and agree.sum() < _EXPLAINED * len(sought) else None
+    return float(agree.sum() / max(len(sought), 1))
 
 
 def untangled(

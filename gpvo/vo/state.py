@@ -16,7 +16,7 @@ from gpvo.types import Array, ImuMoments, StereoCamera, StereoFrame, TrackFrame
 from gpvo.vo.config import VoConfig
 from gpvo.vo.felt import Felt
 from gpvo.vo.frontend import Observation
-from gpvo.vo.rivals import Choice, Expected, Leaps
+from gpvo.vo.rivals import EXPLAINED, Choice, Expected, Leaps, Standing
 
 _GUESS_S = 0.5  # for so long a velocity is taken to last
 _SIGMAS_WITHIN_REACH = 5.0  # of what a vehicle can do
@@ -41,6 +41,7 @@ class State:
     rivalry: float = 0.0  # running sum over the frames in which a second motion was seen
     in_doubt: Array = field(default_factory=lambda: np.zeros((6, 6)))  # covariance of having taken the wrong motion
     odds: float = 0.0  # log odds that the last velocity is that against the scene
+    standing: Standing = field(default_factory=Standing)
     t_twist_ns: int | None = None  # when the velocity was last measured by a plausible motion
     leaps: Leaps = field(default_factory=lambda: Leaps(0))
     refused: Array | None = None  # (6,) per second: the latest velocity that no vehicle could have reached
@@ -77,7 +78,12 @@ class State:
 
         Beside a rival it has to be fresh: what moves otherwise is seen in two frames or never.
         """
-        return parallax_px < config.keyframe_parallax_px and self.rivalry <= 0.2 and self.leaps.before is None
+        return parallax_px < config.keyframe_parallax_px and not self.has_rival and self.leaps.before is None
+
+    @property
+    def has_rival(self) -> bool:
+        """Whether a second motion was seen in one of the last ten frames."""
+        return self.rivalry > 0.2
 
     def stays(self, config: VoConfig) -> bool:
         """Whether the reference is expected to serve beyond the next frame."""
@@ -139,6 +145,23 @@ class State:
             began_ns = t_ns - round(self.felt.span.age_s * 1e9)
             self.leaps.step(t_ns, now, np.concatenate([alone_mps, now[3:]]), began_ns, 0.0)
         self.leaps.contradicted = True
+
+    def unseen(self, share: float, expected: Expected | None, *, goes_on: bool) -> float:
+        """Probability that the scene's motion is none that was seen, beside one that explains this share of the image;
+        it is as likely to be another one that was."""
+        felt = goes_on and expected is not None and expected.felt and self.leaps.before is None
+        return 0.5 * self.standing.wrong(share, goes_on=goes_on, felt=felt)
+
+    def follow(self, t_ns: int, T_ref_cur: Array, share: float, expected: Expected | None, *, goes_on: bool) -> Array:
+        """The motion from the reference explains this share of the image and is taken; covariance (6, 6) of the scene's
+        being none that was seen."""
+        twist = self._velocity(t_ns, T_ref_cur)
+        step_s, dt_s = ((t_ns - since) * 1e-9 for since in (self.t_believed_ns, self.t_ref_ns))
+        has_doubt = share < EXPLAINED and self.has_rival
+        wrong = self.unseen(share, expected, goes_on=goes_on) if has_doubt else 0.0
+        C = wrong * dt_s**2 * self.standing.unseen(twist)
+        self.standing.follow(share, twist, step_s, goes_on=goes_on)
+        return C
 
     def otherwise(self, t_ns: int, T_ref_cur: Array, max_acceleration_mps2: float) -> Array | None:
         """Covariance (6, 6) of the motion from the reference while a velocity that was left may still be the scene's;

@@ -10,7 +10,9 @@ from gpvo.sim.points import simulate_points
 from gpvo.types import Status, VoLog
 from gpvo.vo.config import make_config
 from gpvo.vo.motion import Motion
-from gpvo.vo.rivals import Expected, Leaps, choose
+from gpvo.vo.rivals import Expected, Leaps, Standing, choose
+from hypothesis import given
+from hypothesis import strategies as st
 
 
 def moving(z_m: float, sigma_m: float = 0.003) -> Motion:
@@ -101,6 +103,47 @@ def test_the_unseen_motion_is_only_as_sure_as_what_it_was_expected_from():
     for sigma_m in (0.1, 1.0):
         choice = choose([moving(0.0)], (1,), Expected(moving(2.0).T_prev_cur, 0.5, sigma_m, 3.0))
         assert np.sqrt(choice.otherwise[0, 0]) == pytest.approx(sigma_m, rel=0.1)
+
+
+@pytest.mark.parametrize("wrong", [0.01, 0.3])
+def test_however_likely_a_motion_is_the_covariance_counts_with_its_being_wrong(wrong: float):
+    choice = choose([moving(0.0), moving(2.0, sigma_m=0.2)], (30, 2), expecting(0.0, 3.0), lambda i, on: wrong)
+    share = max(wrong, 1 / (1 + 15**0.5 * np.exp(3.0)))
+    assert choice.otherwise[2, 2] == pytest.approx(share * (2.0**2 + 0.2**2))
+    assert choice.otherwise[0, 0] == pytest.approx(share * 0.2**2)  # what the other one is not sure of counts too
+
+
+@given(st.floats(0.0, 1.0), st.floats(0.0, 1.0))
+def test_the_more_of_the_image_a_motion_explains_the_surer_it_is(first: float, second: float):
+    standing = Standing()
+    for share in (first, second):
+        standing.follow(share, np.zeros(6), 0.1, goes_on=True)
+    few, many = (standing.wrong(s, goes_on=True, felt=False) for s in sorted((first, second)))
+    assert 0.0 < many <= few < 1.0
+    assert standing.wrong(first, goes_on=True, felt=True) < standing.wrong(first, goes_on=True, felt=False)
+
+
+def test_half_of_the_image_tells_nothing_and_what_was_explained_before_is_remembered():
+    assert Standing().wrong(0.5, goes_on=True, felt=False) == pytest.approx(0.5)
+    standing = Standing()
+    for _ in range(50):
+        standing.follow(0.95, np.zeros(6), 0.1, goes_on=True)
+    assert standing.wrong(0.5, goes_on=True, felt=False) < 0.1
+    assert standing.wrong(0.5, goes_on=False, felt=False) == pytest.approx(0.5)  # another motion begins anew
+    for _ in range(200):
+        standing.follow(0.4, np.zeros(6), 0.1, goes_on=True)
+    assert standing.wrong(0.4, goes_on=True, felt=False) > 0.6
+
+
+def test_what_was_not_seen_has_any_velocity_that_the_vehicle_had():
+    velocities = np.random.default_rng(1).normal([0, 0, 20, 0, 0, 0], [0.1, 0.1, 3, 0.01, 0.1, 0.01], (5000, 6))
+    standing = Standing()
+    for v in velocities:
+        standing.follow(0.9, v, 0.1, goes_on=True)
+    usual, at_rest = standing.unseen(velocities.mean(axis=0)), standing.unseen(np.zeros(6))
+    assert np.sqrt(usual[2, 2]) == pytest.approx(3.0, rel=0.1)
+    assert np.sqrt(at_rest[2, 2]) == pytest.approx(20.2, rel=0.02)
+    assert np.linalg.eigvalsh(at_rest)[0] > 0
 
 
 def wrong_and_ok(log: VoLog, truth) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
