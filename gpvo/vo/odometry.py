@@ -205,6 +205,7 @@ class StereoOdometry:
             chosen = replace(chosen, otherwise=_RIVAL_STAYS * state.in_doubt)
         state.odds, state.in_doubt = chosen.odds, chosen.otherwise
         T_ref_cur = motions[chosen.index].T_prev_cur
+        state.clock(t_ns, T_ref_cur)
         if not chosen.plausible:
             state.refuse(t_ns, T_ref_cur)
             is_felt = expected is not None and expected.felt

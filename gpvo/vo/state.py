@@ -21,7 +21,31 @@ from gpvo.vo.rivals import EXPLAINED, Choice, Expected, Leaps, Standing
 _GUESS_S = 0.5  # for so long a velocity is taken to last
 _SIGMAS_WITHIN_REACH = 5.0  # of what a vehicle can do
 _TOO_FAST_NS = 200_000  # for three frames: by arrival, two may come at once
+_MOST_JITTER_S, _JITTER_MEMORY = 0.01, 0.05  # of one motion; share of a motion in what is known
 _SUSPICION_NS = 10 * 10**9  # and a motion that was refused may come back
+
+
+@dataclass
+class Jitter:
+    """How far frames are off their stamps, by the motions that seem too long and too short in turn.
+
+    With white errors n of the stamps and a steady velocity, a motion comes ``x = n_k - 2 n_(k-1) + n_(k-2)`` too late
+    or too early, and two of these in a row have a mean product of ``-4 s^2``; that of a change of velocity is positive.
+    """
+
+    variance_s2: float = 0.0
+    last_s: float = 0.0
+
+    def see(self, off_s: float) -> None:
+        """A motion came so much too late."""
+        off_s = min(max(off_s, -_MOST_JITTER_S), _MOST_JITTER_S)
+        self.variance_s2 += _JITTER_MEMORY * (-off_s * self.last_s / 4.0 - self.variance_s2)
+        self.last_s = off_s
+
+    @property
+    def reach_s(self) -> float:
+        """Five standard deviations of x."""
+        return 5.0 * float(np.sqrt(6.0 * max(self.variance_s2, 0.0)))
 
 
 @dataclass
@@ -46,6 +70,7 @@ class State:
     leaps: Leaps = field(default_factory=lambda: Leaps(0))
     refused: Array | None = None  # (6,) per second: the latest velocity that no vehicle could have reached
     t_refused_ns: int = 0
+    jitter: Jitter = field(default_factory=Jitter)
     felt: Felt | None = None  # None without an IMU in a known place
 
     @classmethod
@@ -98,13 +123,16 @@ class State:
         """The motion to ``t_ns`` expected from the last velocity of the vehicle; None before there is one."""
         if self.t_twist_ns is None:
             return None
-        if t_ns - self.t_refused_ns > _SUSPICION_NS:
-            self.refused = None
         step_s, age_s = ((t_ns - since) * 1e-9 for since in (self.t_believed_ns, self.t_twist_ns))
+        jitter_m = self.jitter.reach_s * float(np.linalg.norm(self.twist[:3]))
+        if self.refused is not None:
+            was_off_m = float(np.linalg.norm((self.refused - self.twist)[:3])) * step_s
+            if t_ns - self.t_refused_ns > _SUSPICION_NS or was_off_m < jitter_m:
+                self.refused = None
         T_refused = None if self.refused is None else self.T_ref_believed @ se3.exp(self.refused * step_s)
         reach_mps = max_acceleration_mps2 * age_s
         sigma_m = reach_mps * step_s / _SIGMAS_WITHIN_REACH
-        expected = Expected(guess, reach_mps * step_s, sigma_m, self.odds, T_refused)
+        expected = Expected(guess, reach_mps * step_s + jitter_m, sigma_m, self.odds, T_refused)
         if self.leaps.before is not None and self.leaps.contradicted:
             left_reach_m = _SIGMAS_WITHIN_REACH * self._sigma_before_mps(t_ns, max_acceleration_mps2) * step_s
             T_left = self.T_ref_believed @ se3.exp(self.leaps.before * step_s)
@@ -114,7 +142,7 @@ class State:
             return expected
         twist = np.concatenate([self.felt.expected(self._lag_s), self.twist[3:]])
         T, sigma_m = self.T_ref_believed @ se3.exp(twist * step_s), self.felt.sigma_mps() * step_s
-        return replace(expected, T_prev_cur=T, reach_m=felt_mps * step_s, sigma_m=sigma_m, felt=True)
+        return replace(expected, T_prev_cur=T, reach_m=felt_mps * step_s + jitter_m, sigma_m=sigma_m, felt=True)
 
     def refuse(self, t_ns: int, T_ref_cur: Array) -> None:
         """No vehicle made this motion from the reference."""
@@ -145,6 +173,14 @@ class State:
             began_ns = t_ns - round(self.felt.span.age_s * 1e9)
             self.leaps.step(t_ns, now, np.concatenate([alone_mps, now[3:]]), began_ns, 0.0)
         self.leaps.contradicted = True
+
+    def clock(self, t_ns: int, T_ref_cur: Array) -> None:
+        """Learn from the motion from the reference, which may be refused, how far the stamps are off."""
+        was_refused = self.refused is not None and self.t_refused_ns == self.t_believed_ns
+        v = (self.refused if was_refused and self.refused is not None else self.twist)[:3]
+        if self.t_twist_ns is not None and v @ v > 0.0:
+            off = (self._velocity(t_ns, T_ref_cur)[:3] - v) @ v / (v @ v)
+            self.jitter.see(float(off) * (t_ns - self.t_believed_ns) * 1e-9)
 
     def unseen(self, share: float, expected: Expected | None, *, goes_on: bool) -> float:
         """Probability that the scene's motion is none that was seen, beside one that explains this share of the image;
