@@ -16,7 +16,6 @@ from gpvo.types import Array, ImuMoments, StereoCamera, StereoFrame, TrackFrame
 from gpvo.vo.config import VoConfig
 from gpvo.vo.felt import Felt
 from gpvo.vo.frontend import Observation
-from gpvo.vo.motion import AT_REST
 from gpvo.vo.rivals import EXPLAINED, Choice, Expected, Leaps, Standing
 
 _GUESS_S = 0.5  # for so long a velocity is taken to last
@@ -73,7 +72,6 @@ class State:
     t_refused_ns: int = 0
     jitter: Jitter = field(default_factory=Jitter)
     felt: Felt | None = None  # None without an IMU in a known place
-    twists: tuple[Array, Array] = (AT_REST, AT_REST)  # per second, at the reference and at the last believed frame
 
     @classmethod
     def begin(cls, t_ns: int, points: int, T_imu_cam: Array | None) -> State:
@@ -223,13 +221,6 @@ class State:
         """How long before the middle of the latest step that of the time since the last believed motion was."""
         return 0.5e-9 * (self.t_last_ns - self.t_believed_ns)
 
-    def moving(self, t_ns: int, T_ref_cur: Array) -> tuple[Array, Array]:
-        """Velocities (6,) per second at the reference and at ``t_ns``, for this motion between them: from one step to
-        the next they change evenly."""
-        now = self._velocity(t_ns, T_ref_cur)
-        change = 0.5 * (now - self.twist) if self.t_twist_ns == self.t_believed_ns else AT_REST
-        return now - change if self.t_ref_ns == self.t_believed_ns else self.twists[0], now + change
-
     def _velocity(self, t_ns: int, T_ref_cur: Array) -> Array:
         """(6,) per second, since the last believed motion."""
         step = se3.log(se3.inverse(self.T_ref_believed) @ T_ref_cur)
@@ -239,7 +230,6 @@ class State:
         self, t_ns: int, T_ref_cur: Array, parallax_px: float, inliers: int, choice: Choice, sigma_m: float
     ) -> None:
         """Take over a measured motion from the reference; its velocity, to ``sigma_m``, only where it tells it."""
-        self.twists = self.moving(t_ns, T_ref_cur)
         self.usual_inliers = inliers if self.usual_inliers == 0 else 0.9 * self.usual_inliers + 0.1 * inliers
         if choice.tells:
             self.twist, self.t_twist_ns = self._velocity(t_ns, T_ref_cur), t_ns
@@ -254,7 +244,6 @@ class State:
 
     def restart(self, t_ns: int, points: int) -> None:
         """The frame at ``t_ns`` is the new reference."""
-        self.twists = (self.twists[1] if t_ns == self.t_believed_ns else AT_REST, AT_REST)
         self.t_ref_ns = self.t_believed_ns = self.t_last_ns = t_ns
         self.T_ref_believed = np.eye(4)
         self.parallax_from_reference_px = 0.0
