@@ -13,8 +13,9 @@ from gpvo.cameras.models import CameraModel, PinholeRadtan
 from gpvo.errors import CalibrationError
 from gpvo.geometry import se3
 from gpvo.types import Array, StereoCamera
-from gpvo.types.sensors import MAX_BASELINE_M, MIN_BASELINE_M
+from gpvo.types.sensors import MAX_BASELINE_M
 
+MIN_BASELINE_M = 1e-3
 LONG_BASELINE_M = 1.5  # from which on centimetres or decimetres are more likely than a rig of that length
 MAX_ROTATION_RAD = np.deg2rad(30.0)
 MAX_FOCAL_RATIO = 1.5

@@ -14,8 +14,8 @@ from gpvo.errors import CalibrationError
 Array = NDArray[np.float64]
 """Of double precision, any shape."""
 
-# Beyond them, of any stereo head for odometry, the numbers are wrong, not the rig unusual.
-MIN_BASELINE_M, MAX_BASELINE_M = 1e-3, 10.0
+# Beyond it, of any stereo head for odometry, the number is wrong, not the rig unusual.
+MAX_BASELINE_M = 10.0
 STANDARD_GRAVITY_MPS2 = 9.80665
 
 
@@ -61,7 +61,7 @@ class StereoCamera:
             least = {"cx_px": -1e9, "cy_px": -1e9, "width": 1.0, "height": 1.0}.get(name, 1e-9)
             if not least <= number < 1e9:
                 raise CalibrationError(f"the camera's {name} is {value!r}, which is impossible")
-        if not MIN_BASELINE_M <= self.baseline_m <= MAX_BASELINE_M:
+        if self.baseline_m > MAX_BASELINE_M:
             raise CalibrationError(f"the camera's baseline_m is {self.baseline_m:g}", cure="is it in metres?")
 
     @property
