@@ -187,7 +187,8 @@ class StereoOdometry:
             return None, Choice()
         motion, held = untangled(motion, matches, self.camera, self._estimate)
         self.pair.note("held", held)
-        free = unexplained(motion, matches, self.camera, self.config)
+        shares = [explained(motion, matches, self.camera, self.config)]
+        free = unexplained(motion, shares[0], matches, self.camera, self.config)
         second = None if free is None else self._estimate(matches, free)
         covered = (1, 0) if second is None else areas(motion, second, matches, self.camera, self.config)
         state.rivalry = _RIVAL_STAYS * state.rivalry + float(covered[1] > 0)
@@ -195,11 +196,11 @@ class StereoOdometry:
         if second is not None and covered[1] > 0:
             state.rival = motion.inliers | second.inliers
             motions.append(second)
+            shares.append(explained(second, matches, self.camera, self.config))
             doubts.append(f"two motions, over {covered[0]} and {covered[1]} parts of the image")
         elif state.rivalry > 1.5:
             doubts.append("two motions in the frames before")
         expected = state.expected(t_ns, guess, self.config.max_acceleration_mps2)
-        shares = [explained(m, matches, self.camera, self.config) for m in motions]
         chosen = choose(motions, covered, expected, lambda i, on: state.unseen(shares[i], expected, goes_on=on))
         if len(motions) == 1 and chosen.plausible:  # a rival that is not found in one frame has not gone
             chosen = replace(chosen, otherwise=_RIVAL_STAYS * state.in_doubt)

@@ -162,8 +162,8 @@ def choose(
     Moments of the mixture: ``sum p_i (d_i d_i^T + C_i)``, with d_i from the chosen motion to another, and C_i of the
     other's translation. ``wrong(index, goes_on)``: probability that another is the scene's, however likely this one is.
     """
-    weight, goes_on, tells, back = _weigh(motions, covered, expected)
     candidates, sigma_m = [m.T_prev_cur for m in motions], [worst_translation_sigma_m(m) for m in motions]
+    weight, goes_on, tells, back = _weigh(motions, sigma_m, covered, expected)
     if len(weight) > len(motions) and expected is not None:
         candidates.append(expected.T_prev_cur)
         sigma_m.append(expected.sigma_m)
@@ -187,7 +187,7 @@ def choose(
 
 
 def _weigh(
-    motions: Sequence[Motion], covered: Sequence[int], expected: Expected | None
+    motions: Sequence[Motion], sigma_m: Sequence[float], covered: Sequence[int], expected: Expected | None
 ) -> tuple[Array, NDArray[np.bool_], NDArray[np.bool_], NDArray[np.bool_]]:
     """Log odds of each motion, and of what was expected where none goes on; which goes on; which tell the velocity; and
     which goes on from a velocity that was left."""
@@ -197,7 +197,7 @@ def _weigh(
         every = np.ones(len(motions), bool)
         return area, every, every, ~every
     off_m = np.array([_apart_m(expected.T_prev_cur, m.T_prev_cur) for m in motions])
-    noise_m = np.array([_NOISE * worst_translation_sigma_m(m) for m in motions])
+    noise_m = _NOISE * np.array(sigma_m)
     within = off_m <= np.hypot(expected.reach_m, noise_m)
     goes_on = within & (off_m == off_m.min())
     if expected.T_refused is not None:  # what is nearer to it is the same thing's, however far a vehicle can have come
@@ -234,11 +234,16 @@ def cells(uv: NDArray[np.floating[Any]], camera: StereoCamera) -> NDArray[np.int
     return row * (int(camera.width / side_px) + 1) + column
 
 
-def unexplained(motion: Motion, matches: Matches, camera: StereoCamera, config: VoConfig) -> NDArray[np.bool_] | None:
-    """(N,) the points, spare ones too, that moved otherwise; None where the motion explains most of the image."""
+def unexplained(
+    motion: Motion, share: float, matches: Matches, camera: StereoCamera, config: VoConfig
+) -> NDArray[np.bool_] | None:
+    """(N,) the points, spare ones too, that moved otherwise; None where the ``share`` that the motion explains is most
+    of the image."""
+    if share >= EXPLAINED:
+        return None
     off_px = _off_px(motion.T_prev_cur, matches, camera)
     free = (matches.uvd_prev[:, 2] > KNOWN_DEPTH_PX) & (off_px > max(config.ransac_threshold_px, 6 * motion.scale_px))
-    return free if free.sum() >= _LEAST and explained(motion, matches, camera, config) < EXPLAINED else None
+    return free if free.sum() >= _LEAST else None
 
 
 def explained(motion: Motion, matches: Matches, camera: StereoCamera, config: VoConfig) -> float:

@@ -176,8 +176,9 @@ class State:
 
     def clock(self, t_ns: int, T_ref_cur: Array) -> None:
         """Learn from the motion from the reference, which may be refused, how far the stamps are off."""
-        was_refused = self.refused is not None and self.t_refused_ns == self.t_believed_ns
-        v = (self.refused if was_refused and self.refused is not None else self.twist)[:3]
+        v = self.twist[:3]
+        if self.refused is not None and self.t_refused_ns == self.t_believed_ns:
+            v = self.refused[:3]
         if self.t_twist_ns is not None and v @ v > 0.0:
             off = (self._velocity(t_ns, T_ref_cur)[:3] - v) @ v / (v @ v)
             self.jitter.see(float(off) * (t_ns - self.t_believed_ns) * 1e-9)

@@ -22,7 +22,7 @@ from gpvo.vo.opencv import Light, halve, in_light_of
 from gpvo.vo.patches import align, cut
 from gpvo.vo.quality import PairWatch
 from gpvo.vo.rig_error import RigError
-from gpvo.vo.rivals import areas, unexplained, untangled
+from gpvo.vo.rivals import areas, explained, unexplained, untangled
 from stereo_points import CAMERA, scene
 
 pytest.importorskip("numba", reason="images need the extra gpvo[sim]")
@@ -303,13 +303,14 @@ def test_a_scene_speaks_against_a_patch_with_more_points() -> None:
     assert motion is not None
     assert scene_motion is not None
     config = make_config()
-    free = unexplained(motion, matches, CAMERA, config)
+    free = unexplained(motion, explained(motion, matches, CAMERA, config), matches, CAMERA, config)
     assert free is not None
     assert free[200:].mean() > 0.8
     assert not free[:200].any()
     assert areas(motion, scene_motion, matches, CAMERA, config)[1] > 15
     alone = Matches(before, after, np.zeros(40), 40, None, None, before)
-    assert unexplained(scene_motion, alone, CAMERA, config) is None
+    share = explained(scene_motion, alone, CAMERA, config)
+    assert unexplained(scene_motion, share, alone, CAMERA, config) is None
 
 
 def drive(count: int) -> stress.Footage:
