@@ -93,7 +93,7 @@ def _tell(out: Path, summary: RunSummary, notes: Sequence[str], json_: bool) -> 
             print(f"source: {summary.source_report}")
         for line in summary.calibration:
             print(f"calibration: {line}")
-        if summary.calibration:
+        if not all(" ms late: " in line for line in summary.calibration):  # which no calibration corrects
             print(f"calibration: 'gpvo calibration {out} -o FILE' writes a corrected one")
 
 
@@ -108,7 +108,17 @@ def calibration(
 
     Example: gpvo calibration runs/mine -o corrected.yaml
     """
-    from gpvo.vo.rig_findings import CAMCHAIN, camchain, corrected, document, explained_px, read_state, rig_of
+    from gpvo.vo.rig_findings import (
+        CAMCHAIN,
+        camchain,
+        corrected,
+        displacements,
+        document,
+        explained_px,
+        lateness,
+        read_state,
+        rig_of,
+    )
 
     log = read_run(run).log
     if (camera := log.camera) is None:
@@ -116,9 +126,10 @@ def calibration(
     state = read_state(run, camera)
     found = document(state, camera)
     rig = rig_of(read_json(run / "rig.json").get("calibration"), camera)
+    displaced = displacements(state, camera)
     found_px, left_px = explained_px(rig, state, camera)
     if out is not None:
-        write_text(out, camchain(corrected(rig, state, camera) if found["findings"] else rig), own=CAMCHAIN)
+        write_text(out, camchain(corrected(rig, state, camera) if displaced else rig), own=CAMCHAIN)
     if json_:
         print_json({"run": str(run), **found, "found_px": found_px, "unexplained_px": left_px})
         return
@@ -126,7 +137,9 @@ def calibration(
     if (lost := log.statuses.count(Status.LOST)) > _MOST_LOST * len(log):
         none = f"too few motions tell: {lost} of {len(log)} are lost; is the calibration of these images?"
     print("\n".join(found["findings"] or [none]))
-    if out is not None and not found["findings"]:
+    if out is not None and lateness(state, camera):
+        note(f"gpvo: no camera chain holds the time between both images; 'gpvo run --calibration-state {run}' does")
+    if out is not None and not displaced:
         print(f"{out}: the calibration, unchanged")
     elif out is not None:
         print(

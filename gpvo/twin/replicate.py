@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 from gpvo.cameras.rig import RIG_ERRORS, TOLERANCES, Tolerance, TrueRig
 from gpvo.errors import GpvoError, SourceError
 from gpvo.files import read_toml
+from gpvo.geometry import se3
 from gpvo.io.run import Run, read_run, read_tracks
 from gpvo.io.source import SourceReport
 from gpvo.parallel import map_jobs
@@ -73,7 +74,7 @@ def estimate(path: Path) -> Original:
     repeats = np.array(["frozen" in r.reason for r in run.log])
     camera = run.log.camera
     rig = read_state(path, camera) if (path / STATE_FILE).is_file() else RigState.exact()
-    uvd = RigError(camera, rig, learn=False).correct(tracks.uvd)
+    uvd = RigError(camera, rig, learn=False).correct(tracks.uvd, _twists(run.log.trajectory(), t_ns)[frame].T)
     seen = Observations(camera, frame, track, uvd, tracks.is_inlier & ~repeats[frame])
     structure = without_loose_frames(adjust(seen, run.log.trajectory()), seen, t_ns)
     if not np.isfinite(structure.residual_px).all():
@@ -83,6 +84,12 @@ def estimate(path: Path) -> Original:
     common = CommonField.of(seen, structure, noise, drawn_signs(len(structure.points_world), neighbours), t_ns)
     start = read_start(path, camera)
     return Original(run, config_of(path), rig, seen, structure, noise, neighbours, common, first, repeats, start)
+
+
+def _twists(T_world_cam: Array, t_ns: NDArray[np.int64]) -> Array:
+    """(F, 6) velocity per second in each frame: the mean of that before and that after it."""
+    before = se3.log(se3.inverse(T_world_cam[:-1]) @ T_world_cam[1:]) / (np.diff(t_ns)[:, None] * 1e-9)
+    return 0.5 * (np.concatenate([before[:1], before]) + np.concatenate([before, before[-1:]]))
 
 
 def _refuse_too_few(frame: NDArray[np.int64], path: Path) -> None:
@@ -200,9 +207,12 @@ def _projected(original: Original, settings: TwinSettings, replicate: int) -> tu
     e, camera = rig_errors(settings)[replicate], seen.camera
     tolerance = replace(settings.tolerance, rotation_rad=0.0) if known.covariance.any() else settings.tolerance
     left, right = TrueRig.of(camera, tolerance, e[:RIG_ERRORS]).pixels(original.structure.in_camera(seen))
-    drawn = replace(known, mean=known.mean + np.append(principal_errors(known, camera) @ e[2:], np.zeros(N_TERMS)))
+    mean = known.mean.copy()
+    mean[:N_TERMS] += principal_errors(known, camera) @ e[2:]
+    drawn = replace(known, mean=mean)
     displaced_d, displaced_row = RigError(camera, drawn, learn=False).errors(
-        np.stack([left[:, 0], left[:, 1], left[:, 0] - right[:, 0]], axis=1)
+        np.stack([left[:, 0], left[:, 1], left[:, 0] - right[:, 0]], axis=1),
+        _twists(original.structure.T_world_cam, original.run.log.t_ns)[seen.frame].T,
     )
     return left, right + np.stack([-displaced_d, displaced_row], axis=1)
 

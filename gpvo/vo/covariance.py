@@ -47,6 +47,10 @@ _CUT_ALONG, _LEFT_ALONG = 4.0, 0.9195
 _CUT_ACROSS, _LEFT_ACROSS = 6.644, 0.99
 _USUAL_RATIO = 10.0  # prior deviation: an error of disparity three times the noise of an image coordinate
 
+_BLOCK = 20  # motions, longer than most features live
+_EXCESS = 16.0, 2.0  # of scatter to begin with, and the number of blocks that this guess is worth
+_DILUTION = 0.1  # share of it, standard deviation: noise differs by direction, so what persists is known no better
+
 
 @dataclass(frozen=True)
 class MotionCovariance:
@@ -307,3 +311,71 @@ class NoiseEstimator:
             return 0.0
         # Between images of nearly the same place hardly anything tells: then the prior does.
         return float((excess - 4.0 * variance / excess) * information / (information**2 + variance / _USUAL_RATIO**2))
+
+
+@dataclass(frozen=True)
+class Sums:
+    """Information (n, n) and score (n,) of errors of the rig as if frames were independent, and the dilution (n,) of
+    the score."""
+
+    information: Array
+    score: Array
+    dilution: Array
+
+    def since(self, before: Sums) -> Sums:
+        """What was added to ``before``."""
+        a, b = self, before
+        return Sums(a.information - b.information, a.score - b.score, a.dilution - b.dilution)
+
+
+class Blocks:
+    """The sums of all motions, and by how much blocks of frames scatter more than if frames were independent."""
+
+    def __init__(self, precision: Array) -> None:
+        self.sums = self._before = Sums(0.0 * precision, 0.0 * precision[0], 0.0 * precision[0])
+        self._count = 0
+        freedom = _EXCESS[1] * len(precision)
+        self._scatter = self._scatter_earlier = (_EXCESS[0] * freedom, freedom)
+        self._floor = 1e-6 * precision
+
+    @property
+    def excess(self) -> float:
+        """Variance of a block's score over its information."""
+        return self._scatter[0] / self._scatter[1]
+
+    def believed(self, among: Sums | None = None) -> tuple[Array, Array]:
+        """Information and score, of which the excess and a share of the dilution may be no signal: of all, or ``among``
+        a part, by the excess of a block ago."""
+        sums, (chi2, freedom) = (self.sums, self._scatter) if among is None else (among, self._scatter_earlier)
+        excess = chi2 / freedom
+        if not sums.dilution.any():
+            return sums.information / excess, sums.score / excess
+        dilution = _DILUTION * sums.dilution
+        diluted = np.linalg.solve(sums.information + self._floor, dilution)
+        part = dilution / (excess + dilution @ diluted)
+        return (
+            (sums.information - np.outer(part, dilution)) / excess,
+            (sums.score - part * (diluted @ sums.score)) / excess,
+        )
+
+    def add(self, information: Array, score: Array, dilution: Array | float = 0.0) -> None:
+        """Take in one motion; the score is that of a state of zero."""
+        s = self.sums
+        self.sums = Sums(s.information + information, s.score + score, s.dilution + dilution)
+        self._count += 1
+
+    def close(self, mean: Array, covariance: Array) -> None:
+        """At the end of a block, compare its score at the estimate with what is expected of it."""
+        if self._count < _BLOCK:
+            return
+        block = self.sums.since(self._before)
+        left = block.score - block.information @ mean
+        chi2 = float(left @ np.linalg.solve(block.information + self._floor, left))
+        freedom = len(mean) - float((block.information * covariance).sum()) / self.excess
+        self._scatter_earlier, self._scatter = self._scatter, (self._scatter[0] + chi2, self._scatter[1] + freedom)
+        self._count, self._before = 0, self.sums
+
+    def forget(self, before: Sums) -> None:
+        """Only what was added to ``before`` counts, and blocks that the change lies in tell nothing of their excess."""
+        self.sums = self.sums.since(before)
+        self._count, self._before, self._scatter = 0, self.sums, self._scatter_earlier

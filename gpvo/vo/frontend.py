@@ -44,8 +44,7 @@ class RightSearch:
 
     Of ``sought`` points ``found`` gave a measurement, ``behind`` lie behind the cameras and ``off_row`` in another row.
     ``row_error_px`` (n,): right row minus left row, of points followed from the previous frame;
-    ``row_motion_px`` (n,): by how much these moved down the left image. ``shifted``: measurements (m, 3) and row errors
-    (m,) of the points found, where most are, but as many rows too low or too high alike; else None.
+    ``row_motion_px`` (n,): by how much these moved down the left image.
     """
 
     sought: int
@@ -54,7 +53,6 @@ class RightSearch:
     off_row: int
     row_error_px: Array
     row_motion_px: Array
-    shifted: tuple[Array, Array] | None = None
 
 
 @dataclass(frozen=True)
@@ -65,6 +63,7 @@ class Matches:
     points found again in the left image, with or without a right one. ``spare`` (N,) marks weaker points where the
     strong ones leave the image empty: they decide no motion while strong ones do, but speak against it; None for none.
     ``right``: how the search in the right image went. ``sought_uvd`` (M, 3): all points of the reference.
+    ``displaced``: those of the frame whose rows are too far off alike, as of :meth:`RigError.displaced`.
     """
 
     uvd_prev: Array
@@ -74,6 +73,7 @@ class Matches:
     spare: NDArray[np.bool_] | None = None
     right: RightSearch | None = None
     sought_uvd: Array | None = None
+    displaced: tuple[Array, Array] | None = None
 
     @property
     def strong(self) -> NDArray[np.bool_]:
@@ -123,12 +123,13 @@ def stereo_uvd(left: Points, right: Points) -> tuple[Array, Array]:
 @dataclass(frozen=True)
 class _Measured:
     """Stereo points of one frame: ``uvd`` (N, 3), ``row_error`` (N,), and the ``mark`` (N, ...) by which they are known
-    again. ``detected``: points of the left image, with or without a right one."""
+    again. ``detected``: points of the left image, with or without a right one. ``displaced``: see :class:`Matches`."""
 
     uvd: Array
     row_error: Array
     mark: NDArray[Any]
     detected: int
+    displaced: tuple[Array, Array] | None
 
 
 class _AfreshFrontend(ABC):
@@ -148,8 +149,9 @@ class _AfreshFrontend(ABC):
             return EMPTY
         i, j = self._pairs(self._reference.mark, self._current.mark)
         sought = self._reference.uvd if self._says_what_was_sought else None
+        now = self._current
         return Matches(
-            self._reference.uvd[i], self._current.uvd[j], self._current.row_error[j], len(i), sought_uvd=sought
+            self._reference.uvd[i], now.uvd[j], now.row_error[j], len(i), sought_uvd=sought, displaced=now.displaced
         )
 
     def promote(self, inliers: NDArray[np.bool_] | None, at_least: int = 0) -> tuple[int, int]:
@@ -175,7 +177,9 @@ class TrackFrontend(_AfreshFrontend):
         limit = max(self._config.max_row_error_px, 3.0)
         good = self._rig_error.allows(uvd, row_error, self._config.min_disparity_px, np.inf, limit)
         track, first = np.unique(frame.track[good], return_index=True)
-        before, self._current = self._current, _Measured(uvd[good][first], row_error[good][first], track, len(uvd))
+        before = self._current
+        displaced = self._rig_error.displaced(uvd, row_error, limit)
+        self._current = _Measured(uvd[good][first], row_error[good][first], track, len(uvd), displaced)
         repeated = before is not None and len(track) > 0 and np.array_equal(before.uvd, self._current.uvd)
         return Observation(None, repeated)
 
@@ -204,9 +208,10 @@ class DescriptorFrontend(_AfreshFrontend):
         i, j = self._pairs(bits, bits_right)
         uvd, row_error = stereo_uvd(uv_left[i], uv_right[j])
         config = self._config
-        limit = config.max_disparity_share * self._camera.width
-        good = self._rig_error.allows(uvd, row_error, config.min_disparity_px, limit, 2 * config.max_row_error_px)
-        self._current = _Measured(uvd[good], row_error[good], bits[i][good], len(uv_left))
+        most_px, rows_px = config.max_disparity_share * self._camera.width, 2 * config.max_row_error_px
+        good = self._rig_error.allows(uvd, row_error, config.min_disparity_px, most_px, rows_px)
+        displaced = self._rig_error.displaced(uvd, row_error, rows_px)
+        self._current = _Measured(uvd[good], row_error[good], bits[i][good], len(uv_left), displaced)
         left_same, right_same = (before is not None and np.array_equal(before[k], self._images[k]) for k in range(2))
         stats = image_stats(frame.left, Light.of(opencv.halve(frame.left)))
         return Observation(stats, left_same and right_same, right_same and not left_same)

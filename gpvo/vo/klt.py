@@ -178,6 +178,7 @@ class KltFrontend:
             spare=(np.flatnonzero(found) >= reference.strong)[good],
             right=self._right_search(both, uv[:, 1] - before.left_uv[:, 1]),
             sought_uvd=reference.seen.uvd,
+            displaced=self._displaced(both),
         )
 
     def _follow(
@@ -332,8 +333,6 @@ class KltFrontend:
         # Points at infinity have no measurable depth, which is nobody's fault; nor is what lies beyond the image.
         far = known & ~behind & (disparity < max(least_px, KNOWN_DEPTH_PX))
         seen = np.abs(row_error[:n]) < self._config.klt_window_px
-        alike = both.inside & np.isfinite(row_error) & ~off_row
-        shifted = abs(usual) > self._config.max_row_error_px and alike.sum() > 0.5 * both.inside.sum()
         return RightSearch(
             int((both.inside & ~far).sum()),
             int((both.good & ~off_row & ~far & ~behind).sum()),
@@ -342,8 +341,12 @@ class KltFrontend:
             # Rows that spread may be those of an image that is late; a turn about the optical axis is the rig's.
             (both.row_error[:n] - self._rig_error.tilt(uvd[:n]))[seen],
             row_motion[seen],
-            (uvd[alike], both.row_error[alike]) if shifted else None,
         )
+
+    def _displaced(self, both: _Found) -> tuple[Array, Array] | None:
+        known = both.inside & np.isfinite(both.row_error)
+        uvd, row_error = both.seen.uvd[known], both.row_error[known]
+        return self._rig_error.displaced(uvd, row_error, self._config.max_row_error_px)
 
     def _find_again(self, reference: _View, current: _View) -> Matches:
         """Match both left images afresh, without any guess and over any change of scale."""
@@ -358,7 +361,8 @@ class KltFrontend:
         self._matched = now.seen[:n][good]
         # Wrong pairs are no second motion: nothing is said of points sought in vain, nor of how rows move.
         right = self._right_search(now, np.empty(0))
-        return Matches(before.seen.uvd[good], self._matched.uvd, now.row_error[:n][good], n, right=right)
+        uvd, displaced = self._matched.uvd, self._displaced(now)
+        return Matches(before.seen.uvd[good], uvd, now.row_error[:n][good], n, right=right, displaced=displaced)
 
     def _features(self, view: _View) -> tuple[Points, NDArray[np.uint8]]:
         if view.features is None:

@@ -93,6 +93,22 @@ def transfer(T_prev_cur: Array, uvd_prev: Array, camera: StereoCamera) -> Transf
     return Transfer(uvd, H, G, m[2], in_front)
 
 
+AT_REST = np.zeros(6)
+
+
+def right_velocity(twist: Array, uvd: Array, camera: StereoCamera, late_s: float = 0.0) -> Array:
+    """(2, N) per second, in normalised coordinates of the right image: velocity of points (N, 3) that stand still,
+    seen by a camera that moves with ``twist`` (6,) per second, or (6, N); its mean over the ``late_s`` that follow."""
+    rho = uvd[:, 2] / (camera.fx_px * camera.baseline_m)
+    x, y = (uvd[:, 0] - camera.cx_px) / camera.fx_px, (uvd[:, 1] - camera.cy_px) / camera.fy_px
+    (tx, ty, tz), (wx, wy, wz) = twist[:3], twist[3:]
+    ahead = wy * x - wx * y - tz * rho
+    out = np.empty((2, len(uvd)))
+    out[0] = wz * y - wy - tx * rho - (x - camera.baseline_m * rho) * ahead
+    out[1] = wx - wz * x - ty * rho - y * ahead
+    return out / (1.0 + late_s * ahead) if late_s else out
+
+
 def residual_covariance(G: Array, S_prev: Array, S_cur: Array, persistent: float = 0.0) -> Array:
     """Covariance (3, 3, N) of (measured - predicted): ``G S_prev G^T + S_cur + persistent g g^T``.
 
@@ -207,6 +223,7 @@ def refine(
     robust: bool = True,
     noise: PointNoise = _PLAIN,
     tolerance_px: float = np.inf,
+    chosen_px: float | None = None,
 ) -> Motion | None:
     """Weighted reprojection error in left and right of the new frame, by Gauss-Newton.
 
@@ -220,7 +237,8 @@ def refine(
     If ``robust``, points within ``tolerance_px`` of the prediction are candidates. The noise scale is taken from their
     median residual, those beyond its 99.9 % ellipsoid are left out, and the rest are weighted by Huber's rule. They are
     chosen anew at each of the first six steps: a first motion from four noisy points disagrees with good ones, and
-    without these the estimate would be biased towards it.
+    without these the estimate would be biased towards it. With a noise scale ``chosen_px`` all are kept: they were
+    chosen before, and ``T_start`` is near the end.
 
     Returns None where the geometry leaves the motion undetermined.
     """
@@ -232,7 +250,9 @@ def refine(
         r = uvd_cur.T - moved.uvd - np.einsum("ikn,kn->in", moved.G, back)
         W = whitener(residual_covariance(moved.G, S, S, persistent))
         z = apply_whitener(W, r)
-        if not robust:
+        if chosen_px is not None:
+            keep, scale, weight = moved.in_front, chosen_px, huber((z**2).sum(0) / chosen_px**2)
+        elif not robust:
             keep, scale, weight = moved.in_front, 1.0, np.ones(r.shape[1])
         elif iteration <= _CHOOSING:
             close = moved.in_front & within(r, tolerance_px)
@@ -251,7 +271,9 @@ def refine(
         left = z - np.einsum("ijn,j->in", A, step)
         smoothed = uvd_prev + _smoothing(S, moved.G, W, left, persistent)
         converged = bool(step @ information @ step < (_AT_REST * scale) ** 2)
-        if np.abs(step).max() < 1e-9 or (iteration > _CHOOSING and np.abs(step).max() < 1e-6):
+        if np.abs(step).max() < 1e-9 or (
+            (iteration > _CHOOSING or chosen_px is not None) and np.abs(step).max() < 1e-6
+        ):
             converged = True
             break
     return Motion(T, keep, scale, r[:, keep].T, smoothed[keep], information, converged, noise)

@@ -35,6 +35,7 @@ from gpvo.vo.state import State, Stopwatch, own_frame
 from gpvo.vo.window import Window
 
 _RIVAL_STAYS = 0.85  # per frame
+_SAME = 0.01  # of the noise: what displaces all points alike by less is less than their mean is known to
 
 
 class StereoOdometry:
@@ -108,6 +109,7 @@ class StereoOdometry:
         matches, motion = self._solve(guess, clock)
         doubts = self.pair.step(seen, matches.right)
         motion, choice = self._choose(matches, motion, guess, frame.t_ns, doubts)
+        matches, motion = self._freed(matches, motion, frame.t_ns)
         clock.lap("motion")
         self.last = Followed(self._raw, np.zeros(len(self._raw.uvd_cur), bool) if motion is None else motion.inliers)
         verdict = judge(
@@ -172,8 +174,32 @@ class StereoOdometry:
     def _match(self, guess: Array, *, from_scratch: bool = False) -> Matches:
         """Matches of the front end, freed from what is known of the rig's errors."""
         assert self._frontend is not None
-        raw = self._raw = self._frontend.match(guess, from_scratch=from_scratch)
-        return replace(raw, uvd_prev=self.rig_error.correct(raw.uvd_prev), uvd_cur=self.rig_error.correct(raw.uvd_cur))
+        assert self._state is not None
+        self._raw = self._frontend.match(guess, from_scratch=from_scratch)
+        return self._corrected((self._state.twists[0], self._state.twist))
+
+    def _corrected(self, twists: tuple[Array, Array]) -> Matches:
+        """The last matches as measured by cameras that moved with these velocities, at the reference and now."""
+        raw, correct = self._raw, self.rig_error.correct
+        return replace(raw, uvd_prev=correct(raw.uvd_prev, twists[0]), uvd_cur=correct(raw.uvd_cur, twists[1]))
+
+    def _freed(self, matches: Matches, motion: Motion | None, t_ns: int) -> tuple[Matches, Motion | None]:
+        """What images that were not taken at one time displace depends on the motion itself: once more, as it is now
+        known, where that displaces anything otherwise."""
+        assert self._state is not None
+        if motion is None or not self.rig_error.is_late:
+            return matches, motion
+        again, among = self._corrected(self._state.moving(t_ns, motion.T_prev_cur)), motion.inliers
+        (before, now), scale_px = ((m.uvd_prev[among], m.uvd_cur[among]) for m in (matches, again)), motion.scale_px
+        off_px = np.abs(np.concatenate([b - a for a, b in zip(before, now, strict=True)])).mean(axis=0)
+        if off_px.max() < _SAME * scale_px:
+            return matches, motion
+        refined = refine(motion.T_prev_cur, *now, self.camera, noise=motion.noise, chosen_px=scale_px)
+        if refined is None:
+            return matches, motion
+        inliers = np.zeros(len(among), bool)
+        inliers[among] = refined.inliers
+        return again, replace(refined, inliers=inliers)
 
     def _choose(
         self, matches: Matches, motion: Motion | None, guess: Array, t_ns: int, doubts: list[str]
@@ -266,9 +292,8 @@ class StereoOdometry:
             moments = ResidualMoments.of(motion.residuals, white.moved.G)
             record = replace(record, **motion_fields(matches, motion, self.camera, moments))
         if motion is None or verdict.status is Status.LOST:
-            right = matches.right
-            if right is not None and right.shifted is not None and not (self.pair.late or self.pair.unsharp):
-                self.rig_error.update_rows(*right.shifted)
+            if matches.displaced is not None and not (self.pair.late or self.pair.unsharp):
+                self.rig_error.update_rows(*matches.displaced)
             known = None if state.t_twist_ns is None else state.twist
             C = lost_covariance((t_ns - state.t_believed_ns) * 1e-9, known)
             return replace(
@@ -282,7 +307,8 @@ class StereoOdometry:
         self._sigmas.update(moments)
         if self._sigmas.estimates:
             self._sigmas.design.update(motion, white, self.camera)
-        adjusted = self._window.adjust(self._raw, motion)
+        twists = state.moving(t_ns, motion.T_prev_cur)
+        adjusted = self._window.adjust(self._raw, motion, twists)
         T_prev_cur = motion.T_prev_cur if adjusted is None else adjusted.T_ref[-1]
         by_method = covariances_by_method(
             config,
@@ -300,7 +326,17 @@ class StereoOdometry:
             row_error, least_px = matches.row_error[motion.inliers], max(config.min_disparity_px, KNOWN_DEPTH_PX)
             # Other doubts may come from the rig's own errors, which only learning ends.
             sharp = not self.pair.unsharp
-            otherwise = otherwise + self.rig_error.update(motion, white, row_error, least_px, sharp=sharp)
+            learnt = self.rig_error.update(
+                motion,
+                white,
+                row_error,
+                least_px,
+                displaced=matches.displaced,
+                disputed=state.is_disputed,
+                sharp=sharp,
+                twists=twists,
+            )
+            otherwise = otherwise + learnt
         return replace(
             record,
             T_prev_cur=T_prev_cur,
@@ -331,6 +367,7 @@ class StereoOdometry:
         parallax_px = median_parallax_px(matches, inliers)
         sigma_m = worst_translation_sigma_m(motion)
         state.believe(record.t_ns, record.T_prev_cur, parallax_px, int(inliers.sum()), choice, sigma_m)
+        self.rig_error.twist = state.twist
         if state.suffices(parallax_px, config) and inliers.sum() > 0.6 * state.reference_points:
             return False, (state.reference_points, state.reference_points)
         counts = self._frontend.promote(inliers if state.rival is None else state.rival, config.min_inliers)

@@ -12,7 +12,9 @@ polynomials of that order (D. Brown, "Decentering distortion of lenses", 1966). 
 polynomials are free, but for the x term of the rows, which no lens makes: it shows a turn about the optical axis. Turns
 are a part of the prior covariance. A Kalman filter of constant state estimates them:
 dx from the residuals of each motion, with the motion as an unknown without a prior, and dy from the rows, which need no
-motion. What cannot be told apart from motion: the depth's scale.
+motion. What cannot be told apart from motion: the depth's scale. One more coefficient is the time by which the right
+image is later than the left one: it displaces a point by its velocity in that image, which the motion and its depth
+tell.
 
 Three things keep it honest. Errors of neighbouring frames are alike (a feature is off in the same way for as long as it
 is tracked): blocks of frames are compared with their expected scatter, and all information is divided by
@@ -35,28 +37,38 @@ from numpy.typing import NDArray
 
 from gpvo.stats.series import median
 from gpvo.types import Array, StereoCamera
-from gpvo.vo.motion import Motion, Whitened, apply_whitener, persistent_direction
+from gpvo.vo.covariance import Blocks, Sums
+from gpvo.vo.motion import AT_REST, Motion, Whitened, apply_whitener, persistent_direction, right_velocity
 
 _HIGHEST = 4  # order
 POWERS = np.array([(n - j, j) for n in range(_HIGHEST + 1) for j in range(n + 1)])  # of x and y, order by order
 ORDER = POWERS.sum(axis=1)
 N_TERMS = len(POWERS)
-_DX, _DY = slice(0, N_TERMS), slice(N_TERMS, None)
+LATE = 2 * N_TERMS  # place of the right image's delay, after the terms of dx and of dy
+N_COEFFICIENTS = LATE + 1
+_DX, _DY = np.append(np.arange(N_TERMS), LATE), np.arange(N_TERMS, N_COEFFICIENTS)
+_TURNS = np.zeros((N_COEFFICIENTS, 3))  # what turns of the right camera about x, y and z displace
+_TURNS[[4, N_TERMS, N_TERMS + 5], 0] = -1.0
+_TURNS[[0, 3, N_TERMS + 4], 1] = 1.0
+_TURNS[[2, N_TERMS + 1], 2] = -1.0, 1.0
+_IN_DX, _IN_DY = np.ix_(_DX, _DX), np.ix_(_DY, _DY)
+_N = len(_DX)  # coefficients that displace one coordinate
 # Standard deviations of the prior. Terms beyond the constant are given at half the width of the image.
 _DISPARITY_PX = (0.1, 0.3)  # the constant, which motion tells least; the others
 _ROW_PX = (3.0, 1.0)  # the constant, the others: rows are seen at once, and cost nothing to leave free
 _ROW_X_PX = 0.1  # the x term of the rows, beyond the turn
 _TURN_RAD = 2.5e-4  # of the right camera about its vertical and its optical axis
+_LATE_S = 2e-3  # of cameras that are not triggered together: software that starts one after the other takes so long
 # Rigs that are not exact: their mounting, and apart from it their lenses, are so many times as wrong, equally likely.
 # A camera can be knocked by any angle; a lens stays what it is.
 _MOUNTINGS, _LENSES = (0.3, 1.0, 4.0, 16.0), (0.3, 1.0, 4.0)
 _ROLLS = (1.0, 16.0)  # the same of the turn about the optical axis, which rows show at once
 _NEGLIGIBLE = 1e-12  # probability of a kind
-_BLOCK = 20  # motions, longer than most features live
-_EXCESS = 16.0, 2.0  # of scatter to begin with, and the number of blocks that this guess is worth
-_DILUTION = 0.1  # share of it, standard deviation: noise differs by direction, so what persists is known no better
-_STEP, _STEPS = 5, 4  # motions between the times at which the cameras may have moved; how many of these are kept
-_MOVED = 10.0  # log odds of two rigs over one from which the cameras have moved: on six real drives at most 5
+_STEP, _STEPS = 5, 20  # motions from one look for a move of the cameras to the next; of those looked back over
+_LIKELY_RAD, _KNOCK_RAD = 1.7e-3, 0.05  # by which a knock turns a camera about each axis, usually and at most
+_JOLT = 0.01  # and by which it moves a lens, in units of the prior
+_MOVED = 50.0  # log odds of two rigs over one from which the cameras have moved: on six real drives at most 20
+_UNDISPLACED = 0.9  # share of the points that lie alike, in rows that are allowed
 _NEAR = 6.0  # disparity of the points used, in standard deviations of noise: that of far ones says nothing for sure
 
 
@@ -72,19 +84,17 @@ def terms(x: Array, y: Array) -> Array:
 
 
 def prior_covariance(camera: StereoCamera, mounting: float = 1.0, lens: float = 1.0, roll: float = 1.0) -> Array:
-    """(30, 30) of the coefficients of dx, then of dy, each in the order of :data:`POWERS`.
+    """(31, 31) of the coefficients of dx, then of dy, each in the order of :data:`POWERS`, and of the delay [s].
 
     Of rigs whose right camera stands ``mounting`` times as wrong as usual, ``roll`` times about its optical axis, and
     whose lenses bend ``lens`` times as wrong.
     """
     reach = (0.5 * camera.width / camera.fx_px) ** ORDER
-    vertical, optical = np.zeros((2, 2 * N_TERMS))
-    vertical[[0, 3]] = 1.0
-    optical[2], optical[N_TERMS + 1] = -1.0, 1.0
+    vertical, optical = np.where(np.arange(N_COEFFICIENTS) < N_TERMS, _TURNS[:, 1], 0.0), _TURNS[:, 2]
     rows_px = np.where(ORDER == 0, *_ROW_PX)
     rows_px[1] = _ROW_X_PX
     disparity_px = np.where(ORDER == 0, mounting * _DISPARITY_PX[0], lens * _DISPARITY_PX[1])
-    free = np.concatenate([disparity_px / camera.fx_px / reach, rows_px / camera.fy_px / reach])
+    free = np.concatenate([disparity_px / camera.fx_px / reach, rows_px / camera.fy_px / reach, [_LATE_S]])
     turns = mounting**2 * np.outer(vertical, vertical) + roll**2 * np.outer(optical, optical)
     return np.diag(free**2) + _TURN_RAD**2 * turns
 
@@ -92,7 +102,7 @@ def prior_covariance(camera: StereoCamera, mounting: float = 1.0, lens: float = 
 def principal_errors(state: RigState, camera: StereoCamera) -> Array:
     """(15, 15) columns whose sum, each times a standard normal number, is a draw of dx; those that displace the image
     most come first."""
-    values, vectors = np.linalg.eigh(state.covariance[_DX, _DX])
+    values, vectors = np.linalg.eigh(state.covariance[:N_TERMS, :N_TERMS])
     root: Array = vectors * np.sqrt(np.maximum(values, 0.0))
     y, x = (f.ravel() for f in np.mgrid[-1:1:7j, -1:1:9j])
     over = terms(0.5 * camera.width / camera.fx_px * x, 0.5 * camera.height / camera.fy_px * y)
@@ -101,7 +111,8 @@ def principal_errors(state: RigState, camera: StereoCamera) -> Array:
 
 @dataclass(frozen=True)
 class RigState:
-    """Coefficients of dx and dy as known: ``mean`` (30,) and ``covariance`` (30, 30), in the order of :data:`POWERS`.
+    """Coefficients as known: ``mean`` (31,) and ``covariance`` (31, 31), of dx, then of dy, each in the order of
+    :data:`POWERS`, and the delay of the right image [s].
 
     ``probability``: that the disparities are off at all.
     """
@@ -113,12 +124,12 @@ class RigState:
     @classmethod
     def prior(cls, camera: StereoCamera) -> RigState:
         """Nothing known but the calibration."""
-        return cls(np.zeros(2 * N_TERMS), prior_covariance(camera), 0.5)
+        return cls(np.zeros(N_COEFFICIENTS), prior_covariance(camera), 0.5)
 
     @classmethod
     def exact(cls) -> RigState:
         """The calibration is right beyond doubt."""
-        return cls(np.zeros(2 * N_TERMS), np.zeros((2 * N_TERMS, 2 * N_TERMS)), 0.0)
+        return cls(np.zeros(N_COEFFICIENTS), np.zeros((N_COEFFICIENTS, N_COEFFICIENTS)), 0.0)
 
 
 class RigError:
@@ -130,31 +141,40 @@ class RigError:
     known : where to start; by default from nothing.
     learn : whether motions change it.
 
-    Where the evidence is that the cameras moved against one another in the last 20 motions, what was learnt before is
-    forgotten (R. Adams, D. MacKay, "Bayesian online changepoint detection", 2007). ``moved``: how often.
+    Where the evidence is that the right camera has turned in the last 20 motions, how it stood before is forgotten (R.
+    Adams, D. MacKay, "Bayesian online changepoint detection", 2007). ``moved``: how often. ``twist``: the camera's
+    velocity (6,) per second where none is given: that expected of the frame at hand.
     """
 
     def __init__(self, camera: StereoCamera, known: RigState | None = None, *, learn: bool = True) -> None:
-        self._camera, self.moved = camera, 0
+        self._camera, self.moved, self.twist = camera, 0, AT_REST
         self.state = known or RigState.prior(camera)
         # What is right beyond doubt stays so.
         self._learn = learn and bool(self.state.covariance.any())
         if not self._learn:
             return
         precision = np.asarray(np.linalg.inv(self.state.covariance), np.float64)
-        self._blocks = (_Blocks(precision[_DX, _DX]), _Blocks(precision[_DY, _DY]))
-        self._motions, self._past = 0, deque[tuple[_Sums, _Sums]](maxlen=_STEPS)
+        self._blocks = tuple(Blocks(precision[part]) for part in (_IN_DX, _IN_DY))
+        self._undisputed = 0  # motions since one was disputed
+        self._motions, self._past = 0, deque[tuple[tuple[Sums, ...], RigState]](maxlen=_STEPS)
         covariances = [prior_covariance(camera, *kind) for kind in product(_MOUNTINGS, _LENSES, _ROLLS)]
-        self._any = _Gaussians.of(np.zeros(2 * N_TERMS), np.stack(covariances))
         # A state from a file is no calibration to return to.
-        self._kinds = self._any if known is None else _Gaussians.of(known.mean, known.covariance[None])
-        self._exact = _Gaussians.of(np.zeros(N_TERMS), prior_covariance(camera, roll=0.0)[None, _DY, _DY])
+        self._kinds = _Gaussians.of(self.state.mean, np.stack(covariances if known is None else [known.covariance]))
+        self._exact = _Gaussians.of(np.zeros(_N), prior_covariance(camera, roll=0.0)[_IN_DY][None])
         self.state = self._mixed(np.zeros_like(precision), np.zeros(len(precision)))
 
-    def correct(self, uvd: Array) -> Array:
-        """Measurements (N, 3) of (u, v, d) as the right camera would have given them in its place [px]."""
-        d_error, row_error = self.errors(uvd)
+    def correct(self, uvd: Array, twist: Array | None = None) -> Array:
+        """Measurements (N, 3) of (u, v, d) as the right camera would have given them in its place and time [px], from a
+        camera that moves with ``twist`` (6,), or (6, N)."""
+        d_error, row_error = self.errors(uvd, twist)
+        if self.is_late:  # the velocity depends on the depth, and so on the disparity without its error
+            d_error, row_error = self.errors(uvd - d_error[:, None] * (1.0, 0.0, 1.0), twist)
         return uvd - np.column_stack([np.zeros_like(d_error), 0.5 * row_error, d_error])
+
+    @property
+    def is_late(self) -> bool:
+        """Whether the right image is known to be earlier or later than the left one by more than a thought."""
+        return bool(abs(self.state.mean[LATE]) > _LATE_S / 10)
 
     def allows(
         self, uvd: Array, row_error: Array, min_disparity_px: float, max_disparity_px: float, max_row_error_px: float
@@ -162,17 +182,39 @@ class RigError:
         """(N,) whether disparity and row of a match are possible, given what is known and what is not."""
         with np.errstate(invalid="ignore"):
             d_expected, row_expected = self.errors(uvd)
-            phi = self._terms(uvd)
-            sigma = self._camera.fy_px * np.sqrt((phi * (self.state.covariance[_DY, _DY] @ phi)).sum(0))
+            phi = np.concatenate([self._at(uvd), right_velocity(self.twist, uvd, self._camera)[1:]])
+            sigma = self._camera.fy_px * np.sqrt((phi * (self.state.covariance[N_TERMS:, N_TERMS:] @ phi)).sum(0))
             d = uvd[:, 2] - d_expected
             rows = np.abs(row_error - row_expected) <= max_row_error_px + 3.0 * sigma
             return (d >= min_disparity_px) & (d <= max_disparity_px) & rows
 
+    def displaced(self, uvd: Array, row_error: Array, max_row_error_px: float) -> tuple[Array, Array] | None:
+        """Measurements (m, 3) and row errors (m,) of the points that lie as many rows too low or too high alike: where
+        most do, and a tenth of these is not allowed for it. Those that are would not say how many rows."""
+        if not len(uvd):
+            return None
+        off = row_error - self.errors(uvd)[1]
+        alike = np.abs(off - median(off)) <= max_row_error_px
+        uvd, row_error = uvd[alike], row_error[alike]
+        near = self.allows(uvd, row_error, -np.inf, np.inf, max_row_error_px)
+        return None if 2 * len(uvd) < len(off) or near.mean() >= _UNDISPLACED else (uvd, row_error)
+
     def update(
-        self, motion: Motion, white: Whitened, row_error: Array, min_disparity_px: float, *, sharp: bool = True
+        self,
+        motion: Motion,
+        white: Whitened,
+        row_error: Array,
+        min_disparity_px: float,
+        *,
+        displaced: tuple[Array, Array] | None = None,
+        disputed: bool = False,
+        sharp: bool = True,
+        twists: tuple[Array, Array] = (AT_REST, AT_REST),
     ) -> Array:
         """Learn from a motion over corrected measurements and its whitened residuals; its inliers have these row errors
-        (M,). Where the images are not equally ``sharp``, it teaches rows alone: what disparities teach lasts.
+        (M,), which do not count where all points of the image are ``displaced``. Where the images are not equally
+        ``sharp``, it teaches rows alone: what disparities teach lasts. ``disputed``: another motion may be that of the
+        scene. ``twists``: the camera's velocity at its begin and at its end.
 
         Returns
         -------
@@ -182,17 +224,19 @@ class RigError:
         z = white.z / scale_px
         # At the points as smoothed by both frames: their noise is independent of the residual, that of the measured
         # ones is not and would be taken for an error of the rig.
-        phi = self._terms(moved.uvd.T)
-        M = fx * moved.G[:, 2][:, None] * self._terms(motion.uvd_prev)
-        M[2] -= fx * phi
+        late_s = float(self.state.mean[LATE])
+        phi = self._terms(moved.uvd.T, twists[1], late_s)
+        M = fx * moved.G[:, 2][:, None] * self._terms(motion.uvd_prev, twists[0], late_s)[0]
+        M[2] -= fx * phi[0]
         B = apply_whitener(white.W, M)
         root = np.sqrt(np.minimum(1.0, 3.2 / np.sqrt((z**2).sum(0) + 1e-9)))
         by_motion, B = white.A * (root / scale_px), B * (root / scale_px)
         A = by_motion.transpose(0, 2, 1).reshape(-1, 6)
-        B = np.column_stack([B.transpose(0, 2, 1).reshape(-1, N_TERMS), (z * root).reshape(-1)])
+        B = np.column_stack([B.transpose(0, 2, 1).reshape(-1, _N), (z * root).reshape(-1)])
         K = np.linalg.solve(A.T @ A, A.T @ B[:, :-1])
-        added: Array = K @ self.state.covariance[_DX, _DX] @ K.T
+        added: Array = K @ self.state.covariance[_IN_DX] @ K.T
         if self._learn:
+            self._undisputed = 0 if disputed else self._undisputed + 1
             sigma_px = motion.scale_px * np.sqrt(1.0 + motion.noise.persistent)
             near = motion.uvd_prev[:, 2] > min_disparity_px + _NEAR * sigma_px
             if sharp and near.sum() >= 8:
@@ -200,16 +244,16 @@ class RigError:
                 g = apply_whitener(white.W, persistent_direction(moved.G)) * (root / scale_px)
                 along = (by_motion[:, :3] * g[:, None]).sum(0)
                 dilution = along * motion.noise.persistent * motion.scale_px**2 / motion.uvd_prev[:, 2]
-                rows = np.tile(near, 3)
-                self._learn_disparities(A[rows], B[rows], dilution[:, near].sum(axis=1))
-            self._learn_rows(phi * self._camera.fy_px, row_error)
+                of_near = np.tile(near, 3)
+                self._learn_disparities(A[of_near], B[of_near], dilution[:, near].sum(axis=1))
+            by_dy, of = (phi, row_error) if displaced is None else (self._terms(displaced[0], twists[1]), displaced[1])
+            self._learn_rows(by_dy[1], of)
             self._conclude()
         return added
 
     def _learn_disparities(self, A: Array, B: Array, dilution: Array) -> None:
-        """``A`` (n, 6) and ``B`` (n, 16): whitened derivatives by the motion, by dx, and residuals; ``dilution``
-        (3,) of the translation's score.
-        """
+        """``A`` (n, 6), ``B`` (n, 17): whitened derivatives by the motion, by dx, and residuals; ``dilution`` (3,) of
+        the translation's score."""
         K = np.linalg.solve(A.T @ A, A.T @ B)
         rest = B - A @ K
         sums = rest.T @ rest
@@ -217,51 +261,55 @@ class RigError:
         score = sums[:-1, -1] + information @ self.state.mean[_DX]
         self._blocks[0].add(information, score, -K[:3, :-1].T @ dilution)
 
-    def _learn_rows(self, rows: Array, row_error: Array) -> None:
-        """``rows`` (15, M): derivatives of the row errors by dy. Far points tell as much as near ones."""
+    def _learn_rows(self, by_dy: Array, row_error: Array) -> None:
+        """``by_dy`` (16, M): derivatives by dy. Far points tell as much as near ones. Cameras that have moved displace
+        all rows, which is no noise of single ones."""
+        rows = self._camera.fy_px * by_dy
         off = row_error - self.state.mean[_DY] @ rows
-        sigma = max(1.4826 * median(np.abs(off)), 0.05)
-        weighted = rows * np.minimum(1.0, 2.5 * sigma / np.maximum(np.abs(off), 1e-9)) / sigma**2
+        off = np.abs(off - np.linalg.lstsq(rows[:3].T, off)[0] @ rows[:3])  # without a shift and a turn
+        sigma = max(1.4826 * median(off), 0.05)
+        weighted = rows * np.minimum(1.0, 2.5 * sigma / np.maximum(off, 1e-9)) / sigma**2
         self._blocks[1].add(weighted @ rows.T, weighted @ row_error)
 
     def update_rows(self, uvd: Array, row_error: Array) -> None:
         """Learn from rows (M,) at measurements (M, 3) alone: those of a pair whose rows leave no motion to be found."""
         if self._learn:
-            self._learn_rows(self._terms(uvd) * self._camera.fy_px, row_error)
+            self._learn_rows(self._terms(uvd, self.twist)[1], row_error)
             self._conclude()
 
     def _look_back(self) -> None:
-        """Forget what came before the cameras moved, if they did."""
+        """If the cameras were turned against one another, forget how they stood, and nothing else."""
         self._motions += 1
-        if self._motions % _STEP:
+        if self._motions % _STEP or not self._past:
             return
-        now = self._blocks[0].sums, self._blocks[1].sums
-        whole = self._evidence(self._kinds, now)
-        for before in reversed(self._past):
-            since = [n.since(b) for n, b in zip(now, before, strict=True)]
-            if self._evidence(self._kinds, before) + self._evidence(self._any, since) - whole > _MOVED:
-                for block, past in zip(self._blocks, before, strict=True):
-                    block.forget(past)
-                self._kinds, self.moved = self._any, self.moved + 1
-                self._past.clear()
-                return
-        self._past.append(now)
+        ages = range(1, len(self._past) + 1)
+        if max(self._turned(age) for age in ages[::_STEP]) > _MOVED:
+            sums, state = self._past[-max(ages, key=self._turned)]
+            for block, before in zip(self._blocks, sums, strict=True):
+                block.forget(before)
+            turned = _KNOCK_RAD**2 * _TURNS @ _TURNS.T + _JOLT**2 * prior_covariance(self._camera)
+            self._kinds = _Gaussians.of(state.mean, (state.covariance + turned)[None])
+            self.moved += 1
+            self._past.clear()
 
-    def _evidence(self, kinds: _Gaussians, sums: Sequence[_Sums]) -> float:
-        """Log probability of what was learnt, up to a term that is the same in sum for its parts."""
-        learnt = [block.believed(s) for s, block in zip(sums, self._blocks, strict=True)]
-        evidence = kinds.given(*_joined(learnt))[2]
-        if len(evidence) == 1:
-            return float(evidence[0])
-        exact = self._exact.given(*(x[None] for x in learnt[1]))[2]
-        return float(np.logaddexp(np.logaddexp.reduce(evidence - np.log(len(evidence))), exact[0]) - np.log(2))
+    def _turned(self, age: int) -> float:
+        """Log odds that the right camera has turned in the last ``age`` motions: what it displaces has to fit together.
+        While another motion was in the image, the rows alone must say so as well."""
+        sums, state = self._past[-age]
+        of_dx, of_dy = (block.believed(block.sums.since(b)) for block, b in zip(self._blocks, sums, strict=True))
+        if age > self._undisputed:
+            odds = _odds_of_a_turn(state, *_joined([(0.0 * of_dx[0], 0.0 * of_dx[1]), of_dy]))
+            if odds <= 0.0:
+                return odds
+        return _odds_of_a_turn(state, *_joined([of_dx, of_dy]))
 
     def _conclude(self) -> None:
         """The state given all that was learnt."""
         self._look_back()
         self.state = self._mixed(*_joined([block.believed() for block in self._blocks]))
-        for part, block in zip((_DX, _DY), self._blocks, strict=True):
-            block.close(self.state.mean[part], self.state.covariance[part, part])
+        for part, square, block in zip((_DX, _DY), (_IN_DX, _IN_DY), self._blocks, strict=True):
+            block.close(self.state.mean[part], self.state.covariance[square])
+        self._past.append((tuple(block.sums for block in self._blocks), self.state))
 
     def _mixed(self, information: Array, score: Array) -> RigState:
         """The posterior over rigs of every kind, as one Gaussian of its mean and covariance."""
@@ -269,7 +317,7 @@ class RigError:
         if len(means) == 1:
             return RigState(means[0], np.asarray(np.linalg.inv(precision[0]), np.float64), 1.0)
         # A rig whose disparities are exact is as likely as all kinds of others.
-        row_precision, row_means, exact_evidence = self._exact.given(information[_DY, _DY], score[_DY])
+        row_precision, row_means, exact_evidence = self._exact.given(information[N_TERMS:, N_TERMS:], score[_DY])
         log_weight = np.append(evidence, exact_evidence + np.log(len(evidence)))
         weight = np.exp(log_weight - log_weight.max())
         weight /= weight.sum()
@@ -280,22 +328,31 @@ class RigError:
         squares = np.linalg.inv(precision[likely]) + means[:, :, None] * means[:, None]
         covariance = np.tensordot(weight[:-1][likely], squares, 1)
         exact = np.linalg.inv(row_precision[0]) + np.outer(row_means[0], row_means[0])
-        covariance[_DY, _DY] += weight[-1] * exact
+        covariance[N_TERMS:, N_TERMS:] += weight[-1] * exact
         return RigState(mean, covariance - np.outer(mean, mean), float(1.0 - weight[-1]))
 
-    def _terms(self, uvd: Array) -> Array:
+    def _terms(self, uvd: Array, twist: Array, late_s: float = 0.0) -> Array:
+        """(2, 16, N) derivatives of dx and of dy by their coefficients, at the place in the right image, from where
+        ``late_s`` may be still to come."""
+        out = np.empty((2, _N, len(uvd)))
+        out[:, :-1], out[:, -1] = self._at(uvd), right_velocity(twist, uvd, self._camera, late_s)
+        return out
+
+    def _at(self, uvd: Array) -> Array:
         """(15, N) the terms at the place in the right image."""
         c = self._camera
         return terms((uvd[:, 0] - uvd[:, 2] - c.cx_px) / c.fx_px, (uvd[:, 1] - c.cy_px) / c.fy_px)
 
     def tilt(self, uvd: Array) -> Array:
         """(N,) the part of the row errors that a turn about the optical axis makes [px]."""
-        return np.asarray(self._camera.fy_px * self.state.mean[N_TERMS + 1] * self._terms(uvd)[1], np.float64)
+        return np.asarray(self._camera.fy_px * self.state.mean[N_TERMS + 1] * self._at(uvd)[1], np.float64)
 
-    def errors(self, uvd: Array) -> tuple[Array, Array]:
-        """(N,) errors of disparity and of the row difference [px]."""
-        phi, mean = self._terms(uvd), self.state.mean
-        return -self._camera.fx_px * (mean[_DX] @ phi), self._camera.fy_px * (mean[_DY] @ phi)
+    def errors(self, uvd: Array, twist: Array | None = None) -> tuple[Array, Array]:
+        """(N,) errors of disparity and of the row difference [px]; ``twist`` as for :meth:`correct`."""
+        c, mean = self._camera, self.state.mean
+        displaced = mean[:LATE].reshape(2, -1) @ self._at(uvd)
+        displaced += mean[LATE] * right_velocity(self.twist if twist is None else twist, uvd, c)
+        return -c.fx_px * displaced[0], c.fy_px * displaced[1]
 
 
 @dataclass(frozen=True)
@@ -323,76 +380,20 @@ class _Gaussians:
         return precision, mean, 0.5 * ((mean * total).sum(axis=1) - self.at_mean + log_det)
 
 
+def _odds_of_a_turn(state: RigState, information: Array, score: Array) -> float:
+    """Log odds that the right camera has turned since it was known as ``state``, by what was measured since then."""
+    score, evidence = score - information @ state.mean, []
+    for turn_rad in (0.0, _LIKELY_RAD):
+        covariance = state.covariance + turn_rad**2 * _TURNS @ _TURNS.T
+        A = np.eye(N_COEFFICIENTS) + covariance @ information
+        evidence.append(0.5 * float(score @ np.linalg.solve(A, covariance @ score) - np.linalg.slogdet(A)[1]))
+    return evidence[1] - evidence[0]
+
+
 def _joined(learnt: Sequence[tuple[Array, Array]]) -> tuple[Array, Array]:
-    """Information (30, 30) and score (30,) of both polynomials from those of each."""
-    information, score = np.zeros((2 * N_TERMS, 2 * N_TERMS)), np.zeros(2 * N_TERMS)
-    (information[_DX, _DX], score[_DX]), (information[_DY, _DY], score[_DY]) = learnt
+    """Information (31, 31) and score (31,) of all coefficients from those of dx and of dy, which share the delay."""
+    information, score = np.zeros((N_COEFFICIENTS, N_COEFFICIENTS)), np.zeros(N_COEFFICIENTS)
+    for part, square, (more, more_score) in zip((_DX, _DY), (_IN_DX, _IN_DY), learnt, strict=True):
+        information[square] += more
+        score[part] += more_score
     return information, score
-
-
-@dataclass(frozen=True)
-class _Sums:
-    """Information (15, 15) and score (15,) of one polynomial as if frames were independent, and the dilution (15,) of
-    the score."""
-
-    information: Array
-    score: Array
-    dilution: Array
-
-    def since(self, before: _Sums) -> _Sums:
-        """What was added to ``before``."""
-        a, b = self, before
-        return _Sums(a.information - b.information, a.score - b.score, a.dilution - b.dilution)
-
-
-class _Blocks:
-    """The sums of one polynomial, and by how much blocks of frames scatter more than if frames were independent."""
-
-    def __init__(self, precision: Array) -> None:
-        self.sums = self._before = _Sums(np.zeros((N_TERMS, N_TERMS)), np.zeros(N_TERMS), np.zeros(N_TERMS))
-        self._count = 0
-        freedom = _EXCESS[1] * N_TERMS
-        self._scatter = self._scatter_earlier = (_EXCESS[0] * freedom, freedom)
-        self._floor = 1e-6 * precision
-
-    @property
-    def excess(self) -> float:
-        """Variance of a block's score over its information."""
-        return self._scatter[0] / self._scatter[1]
-
-    def believed(self, among: _Sums | None = None) -> tuple[Array, Array]:
-        """Information and score, of which the excess and a share of the dilution may be no signal: of all, or ``among``
-        a part, by the excess of a block ago."""
-        sums, (chi2, freedom) = (self.sums, self._scatter) if among is None else (among, self._scatter_earlier)
-        excess = chi2 / freedom
-        if not sums.dilution.any():
-            return sums.information / excess, sums.score / excess
-        dilution = _DILUTION * sums.dilution
-        diluted = np.linalg.solve(sums.information + self._floor, dilution)
-        part = dilution / (excess + dilution @ diluted)
-        return (
-            (sums.information - np.outer(part, dilution)) / excess,
-            (sums.score - part * (diluted @ sums.score)) / excess,
-        )
-
-    def add(self, information: Array, score: Array, dilution: Array | float = 0.0) -> None:
-        """Take in one motion; the score is that of a state of zero."""
-        s = self.sums
-        self.sums = _Sums(s.information + information, s.score + score, s.dilution + dilution)
-        self._count += 1
-
-    def close(self, mean: Array, covariance: Array) -> None:
-        """At the end of a block, compare its score at the estimate with what is expected of it."""
-        if self._count < _BLOCK:
-            return
-        block = self.sums.since(self._before)
-        left = block.score - block.information @ mean
-        chi2 = float(left @ np.linalg.solve(block.information + self._floor, left))
-        freedom = N_TERMS - float((block.information * covariance).sum()) / self.excess
-        self._scatter_earlier, self._scatter = self._scatter, (self._scatter[0] + chi2, self._scatter[1] + freedom)
-        self._count, self._before = 0, self.sums
-
-    def forget(self, before: _Sums) -> None:
-        """Only what was added to ``before`` counts, and blocks that the change lies in tell nothing of their excess."""
-        self.sums = self.sums.since(before)
-        self._count, self._before, self._scatter = 0, self.sums, self._scatter_earlier

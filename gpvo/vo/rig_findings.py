@@ -19,7 +19,7 @@ from gpvo.errors import CalibrationError, SourceError
 from gpvo.files import plain, read_json
 from gpvo.geometry import se3
 from gpvo.types import Array, StereoCamera
-from gpvo.vo.rig_error import N_TERMS, ORDER, POWERS, RigState, terms
+from gpvo.vo.rig_error import LATE, N_TERMS, ORDER, POWERS, RigState, terms
 
 STATE_FILE = "calibration_state.json"
 _WORTH_PX = 0.2  # somewhere in the image; below, no one would calibrate anew
@@ -34,12 +34,30 @@ def _power(name: str, n: int) -> str:
 _TERMS = [_power("x", i) + _power("y", j) or "1" for i, j in POWERS.tolist()]
 
 
-_NAMES = [f"{d}:{t}" for d in ("dx", "dy") for t in _TERMS]
+_NAMES = [*(f"{d}:{t}" for d in ("dx", "dy") for t in _TERMS), "dt"]
 """Of the coefficients in a file, in the order of a state."""
+
+
+def lateness(state: RigState, camera: StereoCamera) -> list[str]:
+    """What the state says of the times of both images; empty if they are one."""
+    late_s, sigma_s = float(state.mean[LATE]), math.sqrt(state.covariance[LATE, LATE])
+    # A turn by 1 rad/s displaces by so much.
+    if not (abs(late_s) * camera.fx_px > _WORTH_PX and abs(late_s) > _SIGMAS * sigma_s):
+        return []
+    side = "right" if late_s > 0 else "left"
+    return [
+        f"the {side} image is {1e3 * abs(late_s):.1f} ms late: trigger both cameras together; until then, what is known"
+        " of it is taken off"
+    ]
 
 
 def findings(state: RigState, camera: StereoCamera) -> list[str]:
     """What the state says, one line each; empty for a calibration that fits."""
+    return lateness(state, camera) + displacements(state, camera)
+
+
+def displacements(state: RigState, camera: StereoCamera) -> list[str]:
+    """What the state says of the calibration."""
     half, half_high = 0.5 * camera.width / camera.fx_px, 0.5 * camera.height / camera.fy_px
     sigma = np.sqrt(np.diagonal(state.covariance))
     fx, fy = camera.fx_px, camera.fy_px
@@ -62,9 +80,11 @@ def findings(state: RigState, camera: StereoCamera) -> list[str]:
             " axis"
         )
     if shown(row_focal, fy * half_high):
+        one_time = _SIGMAS * sigma[LATE] * fx < _WORTH_PX
         lines.append(
-            f"rows spread: consistent with focal lengths that differ by {100 * abs(c[row_focal]):.2f} %, or, if the"
-            " camera moves ahead, with left and right images that were not taken at one time"
+            f"rows spread: consistent with focal lengths that differ by {100 * abs(c[row_focal]):.2f} %"
+            + ", or, if the camera moves ahead, with left and right images that were not taken at one time"
+            * (not one_time)
         )
     if state.probability > 0.95:
         if shown(0, fx):
@@ -143,9 +163,11 @@ def _state_of(read: dict[str, Any], path: Path, camera: StereoCamera) -> RigStat
     # Of terms that a file does not name, nothing is known.
     state = RigState.prior(camera)
     mean, covariance = state.mean.copy(), state.covariance.copy()
+    if not read_covariance.any():  # a calibration that is right beyond doubt
+        covariance[:] = 0.0
     covariance[place], covariance[:, place] = 0.0, 0.0
     # At half the width of the image all terms displace alike, however narrow the view.
-    reach = np.tile((0.5 * camera.width / camera.fx_px) ** ORDER, 2)
+    reach = np.append(np.tile((0.5 * camera.width / camera.fx_px) ** ORDER, 2), 1.0)
     with np.errstate(over="ignore", invalid="ignore"):  # Comparisons with NaN are false.
         mean[place], covariance[np.ix_(place, place)] = read_mean, 0.5 * (read_covariance + read_covariance.T)
         uncertain = bool(covariance.any())  # else the calibration is right beyond doubt
@@ -222,7 +244,7 @@ def _explanation(rig: StereoRig, state: RigState, camera: StereoCamera) -> tuple
         return np.stack([X / Z, Y / Z])
 
     by = np.stack([(meant(-e) - meant(e)).ravel() for e in _STEP * np.eye(6)], axis=1) / (2 * _STEP)
-    found = (state.mean.reshape(2, N_TERMS) @ terms(x[seen], y[seen])).ravel()
+    found = (state.mean[:LATE].reshape(2, N_TERMS) @ terms(x[seen], y[seen])).ravel()
     known = np.isfinite(by).all(axis=1)
     by, found = by[known], found[known]
     p = np.asarray(np.linalg.lstsq(by, found, rcond=None)[0], np.float64)

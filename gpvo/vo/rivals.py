@@ -86,12 +86,16 @@ class Leaps:
     def step(self, t_ns: int, now: Array, last: Array, t_last_ns: int, reach_mps: float) -> None:
         """The velocity leapt to ``now`` (6,) at ``t_ns``, from ``last`` (6,) at ``t_last_ns``; a vehicle can be off the
         one that was left by ``reach_mps``."""
-        if self.before is None:
+        if self.before is None or (self.contradicted and not self.differs(last, reach_mps)):
             self.before, self.left_ns, self.contradicted = last, t_last_ns, False
             self.until_ns = t_ns + min(t_last_ns - self.began_ns, _LONGEST_DOUBT_NS)
-        elif np.linalg.norm((now - self.before)[:3]) <= reach_mps:
+        elif not self.differs(now, reach_mps):
             self.before = None
         self.began_ns = t_ns
+
+    def differs(self, twist: Array, reach_mps: float) -> bool:
+        """Whether a velocity (6,) can be told from the one that was left, which an IMU cannot carry on for ever."""
+        return self.before is not None and float(np.linalg.norm((twist - self.before)[:3])) > reach_mps
 
     @property
     def reason(self) -> str:

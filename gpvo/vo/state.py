@@ -16,6 +16,7 @@ from gpvo.types import Array, ImuMoments, StereoCamera, StereoFrame, TrackFrame
 from gpvo.vo.config import VoConfig
 from gpvo.vo.felt import Felt
 from gpvo.vo.frontend import Observation
+from gpvo.vo.motion import AT_REST
 from gpvo.vo.rivals import EXPLAINED, Choice, Expected, Leaps, Standing
 
 _GUESS_S = 0.5  # for so long a velocity is taken to last
@@ -72,6 +73,7 @@ class State:
     t_refused_ns: int = 0
     jitter: Jitter = field(default_factory=Jitter)
     felt: Felt | None = None  # None without an IMU in a known place
+    twists: tuple[Array, Array] = (AT_REST, AT_REST)  # per second, at the reference and at the last believed frame
 
     @classmethod
     def begin(cls, t_ns: int, points: int, T_imu_cam: Array | None) -> State:
@@ -110,6 +112,11 @@ class State:
         """Whether a second motion was seen in one of the last ten frames."""
         return self.rivalry > 0.2
 
+    @property
+    def is_disputed(self) -> bool:
+        """Whether another motion than the last may be that of the scene."""
+        return self.has_rival or self.leaps.before is not None or self.refused is not None
+
     def stays(self, config: VoConfig) -> bool:
         """Whether the reference is expected to serve beyond the next frame."""
         return self.suffices(self.parallax_from_reference_px + self.parallax_px, config)
@@ -134,9 +141,10 @@ class State:
         sigma_m = reach_mps * step_s / _SIGMAS_WITHIN_REACH
         expected = Expected(guess, reach_mps * step_s + jitter_m, sigma_m, self.odds, T_refused)
         if self.leaps.before is not None and self.leaps.contradicted:
-            left_reach_m = _SIGMAS_WITHIN_REACH * self._sigma_before_mps(t_ns, max_acceleration_mps2) * step_s
-            T_left = self.T_ref_believed @ se3.exp(self.leaps.before * step_s)
-            expected = replace(expected, T_left=T_left, left_reach_m=left_reach_m)
+            left_reach_mps = _SIGMAS_WITHIN_REACH * self._sigma_before_mps(t_ns, max_acceleration_mps2)
+            if self.leaps.differs(self.twist, left_reach_mps):
+                T_left = self.T_ref_believed @ se3.exp(self.leaps.before * step_s)
+                expected = replace(expected, T_left=T_left, left_reach_m=left_reach_mps * step_s)
         felt_mps = np.inf if self.felt is None else self.felt.reach_mps(suspicious=self.refused is not None)
         if self.felt is None or felt_mps >= reach_mps:
             return expected
@@ -222,6 +230,13 @@ class State:
         """How long before the middle of the latest step that of the time since the last believed motion was."""
         return 0.5e-9 * (self.t_last_ns - self.t_believed_ns)
 
+    def moving(self, t_ns: int, T_ref_cur: Array) -> tuple[Array, Array]:
+        """Velocities (6,) per second at the reference and at ``t_ns``, for this motion between them: from one step to
+        the next they change evenly."""
+        now = self._velocity(t_ns, T_ref_cur)
+        change = 0.5 * (now - self.twist) if self.t_twist_ns == self.t_believed_ns else AT_REST
+        return now - change if self.t_ref_ns == self.t_believed_ns else self.twists[0], now + change
+
     def _velocity(self, t_ns: int, T_ref_cur: Array) -> Array:
         """(6,) per second, since the last believed motion."""
         step = se3.log(se3.inverse(self.T_ref_believed) @ T_ref_cur)
@@ -231,6 +246,7 @@ class State:
         self, t_ns: int, T_ref_cur: Array, parallax_px: float, inliers: int, choice: Choice, sigma_m: float
     ) -> None:
         """Take over a measured motion from the reference; its velocity, to ``sigma_m``, only where it tells it."""
+        self.twists = self.moving(t_ns, T_ref_cur)
         self.usual_inliers = inliers if self.usual_inliers == 0 else 0.9 * self.usual_inliers + 0.1 * inliers
         if choice.tells:
             self.twist, self.t_twist_ns = self._velocity(t_ns, T_ref_cur), t_ns
@@ -245,6 +261,7 @@ class State:
 
     def restart(self, t_ns: int, points: int) -> None:
         """The frame at ``t_ns`` is the new reference."""
+        self.twists = (self.twists[1] if t_ns == self.t_believed_ns else AT_REST, AT_REST)
         self.t_ref_ns = self.t_believed_ns = self.t_last_ns = t_ns
         self.T_ref_believed = np.eye(4)
         self.parallax_from_reference_px = 0.0

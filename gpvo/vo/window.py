@@ -12,7 +12,7 @@ section 6.1); with two frames alone this is the estimate of ``refine``.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -165,9 +165,11 @@ def _predict(T_ref: Array, uvd: Array, camera: StereoCamera) -> tuple[Array, Arr
 
 @dataclass(frozen=True)
 class _Frame:
-    """A frame before the reference: its pose (4, 4) in the reference, and the measurements (n, 3) of tracks (n,)."""
+    """A frame before the reference: its pose (4, 4) in the reference, its velocity (6,) per second, and the
+    measurements (n, 3) of tracks (n,)."""
 
     T_ref: Array
+    twist: Array
     track: NDArray[np.int64]
     uvd: Array
 
@@ -191,9 +193,9 @@ class Window:
         self._begun = 0
         self._next: tuple[tuple[_Frame, ...], dict[bytes, int]] = ((), {})
 
-    def adjust(self, matches: Matches, motion: Motion) -> Adjusted | None:
+    def adjust(self, matches: Matches, motion: Motion, twists: tuple[Array, Array]) -> Adjusted | None:
         """The motion adjusted with the frames before it; None where it stands as it is: there are none, or they
-        contradict it beyond its own noise. ``matches`` as measured."""
+        contradict it beyond its own noise. ``matches`` as measured; ``twists``: velocities at begin and end."""
         if self._size <= 2:
             return None
         before, now = matches.uvd_prev[motion.inliers], matches.uvd_cur[motion.inliers]
@@ -201,15 +203,16 @@ class Window:
         self._begun += len(track)
         frames = [f for f in self._frames if np.isin(track, f.track).sum() >= _LEAST]
         T_ref = np.stack([*(f.T_ref for f in frames), motion.T_prev_cur])
-        found = self._solve(before, now, track, frames, T_ref, motion.noise) if frames else None
+        free = self._rig_error.correct(before, twists[0]), self._rig_error.correct(now, twists[1])
+        found = self._solve(*free, track, frames, T_ref, motion.noise) if frames else None
         if found is not None:
             off = se3.log(se3.inverse(motion.T_prev_cur) @ found.T_ref[-1])
             if off @ motion.information @ off > _CHI2_6_999 * motion.scale_px**2:
                 found = None
         T_cur = se3.inverse(T_ref[-1] if found is None else found.T_ref[-1])
         T_ref = T_cur @ (T_ref if found is None else found.T_ref)
-        older = [_Frame(T, f.track, f.uvd) for T, f in zip(T_ref[:-1], frames, strict=True)]
-        kept = (*older, _Frame(T_cur, track, before))[-(self._size - 2) :]
+        older = [replace(f, T_ref=T) for T, f in zip(T_ref[:-1], frames, strict=True)]
+        kept = (*older, _Frame(T_cur, twists[0], track, before))[-(self._size - 2) :]
         self._next = kept, dict(zip(keys(now), track.tolist(), strict=True))
         return found
 
@@ -219,10 +222,10 @@ class Window:
         uvd, seen = np.zeros((len(T_ref), len(track), 3)), np.ones((len(T_ref), len(track)), bool)
         for v, frame in enumerate(frames):
             _, i, j = np.intersect1d(track, frame.track, return_indices=True)
-            uvd[v, i] = self._rig_error.correct(frame.uvd[j])
+            uvd[v, i] = self._rig_error.correct(frame.uvd[j], frame.twist)
             seen[v] = np.isin(np.arange(len(track)), i)
-        uvd[-1] = self._rig_error.correct(now)
-        return adjust(Views(self._rig_error.correct(before), uvd, seen, T_ref, self._camera), noise)
+        uvd[-1] = now
+        return adjust(Views(before, uvd, seen, T_ref, self._camera), noise)
 
     def advance(self, is_reference: bool) -> None:
         """The last frame is the new reference or not; if it had no motion, all begins anew with it."""

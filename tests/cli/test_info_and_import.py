@@ -19,7 +19,7 @@ from gpvo.geometry import se3
 from gpvo.io.run import read_run, write_run
 from gpvo.io.trajectory import write_tum
 from gpvo.types import Status, StereoCamera, Vehicle, VoLog, VoRecord
-from gpvo.vo.rig_error import RigState
+from gpvo.vo.rig_error import N_COEFFICIENTS, RigState
 from gpvo.vo.rig_findings import document
 
 from command_line import gpvo
@@ -359,7 +359,7 @@ def test_what_a_corrected_calibration_leaves(tmp_path, term, told):
     camera = StereoCamera(380.0, 380.0, 319.5, 239.5, 0.12, 640, 480)
     write_run(tmp_path / "r", VoLog([VoRecord(0, 0, Status.START, np.eye(4))], camera=camera))
     for size, text in ((0.0, "c.yaml: the calibration, unchanged"), (0.01, told)):
-        state = RigState(size * np.eye(30)[term], 1e-6 * np.eye(30), 1.0)
+        state = RigState(size * np.eye(N_COEFFICIENTS)[term], 1e-6 * np.eye(N_COEFFICIENTS), 1.0)
         write_json(tmp_path / "r" / "calibration_state.json", document(state, camera))
         code, out, err = gpvo("calibration", tmp_path / "r", "-o", tmp_path / "c.yaml")
         assert code == 0
@@ -371,7 +371,7 @@ def test_a_run_that_is_mostly_lost_has_not_shown_its_calibration(tmp_path):
     records = [VoRecord(0, 0, Status.START, np.eye(4))]
     records += [VoRecord(k, 0, Status.LOST, np.eye(4), reason=f"only {k} of 99 points agree") for k in range(1, 10)]
     write_run(tmp_path / "r", VoLog(records, camera=camera))
-    state = RigState(np.zeros(30), 1e-6 * np.eye(30), 1.0)
+    state = RigState(np.zeros(N_COEFFICIENTS), 1e-6 * np.eye(N_COEFFICIENTS), 1.0)
     write_json(tmp_path / "r" / "calibration_state.json", document(state, camera))
     code, out, _ = gpvo("calibration", tmp_path / "r")
     assert (code, out) == (0, "too few motions tell: 9 of 10 are lost; is the calibration of these images?\n")

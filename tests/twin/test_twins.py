@@ -19,7 +19,7 @@ from gpvo.twin.gap import Gap, pooled, read_gap
 from gpvo.twin.replicate import TwinSettings, estimate, make_twins, read_tolerance, rig_errors, twin_source
 from gpvo.types import StereoCamera
 from gpvo.vo.config import VoConfig
-from gpvo.vo.rig_error import N_TERMS, RigState
+from gpvo.vo.rig_error import N_COEFFICIENTS, N_TERMS, RigState
 from gpvo.vo.rig_findings import read_start, read_state
 from typer.testing import CliRunner
 
@@ -131,7 +131,7 @@ def test_each_twin_draws_its_own_rig(flown):
 def test_the_rig_of_a_twin_is_wrong_as_odometry_found_it(flown):
     original = estimate(flown[0] / "run")
     fx = original.seen.camera.fx_px
-    n = 2 * N_TERMS
+    n = N_COEFFICIENTS
     mean, covariance = np.zeros(n), np.zeros((n, n))
     mean[[0, N_TERMS]], covariance[0, 0] = (2e-3, 1e-3), 3e-4**2  # the right image too far right, and too low
 

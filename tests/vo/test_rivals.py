@@ -73,6 +73,18 @@ def test_a_leap_is_in_doubt_until_one_leads_back_or_it_has_lasted_as_long():
     assert leaps.doubted(17 * seconds) is None
 
 
+def test_a_velocity_that_cannot_be_told_from_the_one_seen_ends_no_doubt():
+    """The IMU contradicts 7 m/s, which are seen instead of 15; so long after that 15 +- 10 may be either."""
+    seconds, left, seen, car = 10**9, *(np.array([0, 0, v, 0, 0, 0]) for v in (15.0, 7.0, 5.5))
+    leaps = Leaps(began_ns=0)
+    leaps.step(8 * seconds, seen, left, 8 * seconds, 1.0)
+    leaps.contradicted = True
+    leaps.step(15 * seconds, car, seen, 149 * seconds // 10, 10.0)
+    assert leaps.doubted(15 * seconds) is seen
+    leaps.step(16 * seconds, seen + 0.1, car, 159 * seconds // 10, 1.0)
+    assert leaps.doubted(16 * seconds) is None
+
+
 def test_alone_and_as_expected_it_is_sure_of_itself():
     choice = choose([moving(2.0)], (1,), expecting(1.99, 0.5))
     assert choice.plausible
@@ -185,6 +197,7 @@ def test_an_imu_tells_a_car_that_sets_off_with_the_vehicle(tmp_path, seed):
     assert ok.sum() > 50
     assert locked.sum() > 20
     assert not (locked & ok).any()
+    assert not any("moved against one another" in record.reason for record in log)  # they did not
     assert (locked & (wrong_m > 6 * sigma_m)).sum() <= 0.15 * locked.sum()
 
 

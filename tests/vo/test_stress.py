@@ -177,10 +177,11 @@ def test_the_cause_is_named_with_its_cure(footage: stress.Footage) -> None:
     assert odometry.pair.findings() == []
 
 
+@pytest.mark.parametrize("seed", [5, 8])  # of the second, a turn about x was not noticed at all
 @pytest.mark.parametrize("degrees", [(0.3, 0.0, 0.0), (0.0, 0.3, 0.0), (0.0, 0.0, -0.5)])
-def test_a_knock_in_flight_is_forgotten_and_named(degrees: tuple[float, float, float]) -> None:
+def test_a_knock_in_flight_is_forgotten_and_named(degrees: tuple[float, float, float], seed: int) -> None:
     """The right camera turns at frame 30. Motions from frame 44 on were wrong by 3 (x), 8 (y) and 20 % (z), median."""
-    clip = render_clip(pinhole(480, 360), wander(56, speed_mps=1.6, seed=5))
+    clip = render_clip(pinhole(480, 360), wander(56, speed_mps=1.6, seed=seed))
     changed = stress.knocked(degrees)(stress.Footage(clip.camera, clip.frames, clip.T_world_cam))
     outcome = stress.run(changed)
     assert np.median(outcome.error_m[44:] / outcome.moved_m[44:]) < 0.03
