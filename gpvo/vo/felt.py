@@ -127,6 +127,12 @@ class Felt:
         """Whether the velocity is."""
         return bool(np.isfinite(self.P[0, 0]))
 
+    @property
+    def proven(self) -> float:
+        """How far it has been right about changes of velocity, from 0 to 1: of a car that accelerates as the vehicle
+        does, an IMU that knows no gravity yet feels none."""
+        return max(0.0, 1.0 - float(np.sqrt(self.wrong[0] / self.wrong[1])))
+
     def expected(self, lag_s: float = 0.0) -> Array:
         """(3,) velocity of the camera in its axes, in the middle of the latest step or so long before."""
         return np.asarray(self.velocity_mps - lag_s * self.acceleration_mps2 - self._of_lever())

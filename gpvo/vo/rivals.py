@@ -128,8 +128,9 @@ class Standing:
     square: Array = field(default_factory=lambda: np.diag([1.0] * 3 + [0.25] * 3))  # mean of their outer products
     age_s: float = 1.0
 
-    def wrong(self, share: float, *, goes_on: bool, felt: bool) -> float:
-        """Probability that a motion that explains this share is not that of the scene; ``felt``: an IMU says it is."""
+    def wrong(self, share: float, *, goes_on: bool, felt: float) -> float:
+        """Probability that a motion that explains this share is not that of the scene; ``felt``: how far an IMU, which
+        says it is, is to be trusted, from 0 to 1."""
         now = _log_odds(share)
         before = self.before if goes_on and self.before is not None else now
         return float(1 / (1 + np.exp(now + before + _SUREST * felt)))

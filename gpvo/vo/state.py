@@ -194,7 +194,8 @@ class State:
     def unseen(self, share: float, expected: Expected | None, *, goes_on: bool) -> float:
         """Probability that the scene's motion is none that was seen, beside one that explains this share of the image;
         it is as likely to be another one that was."""
-        felt = goes_on and expected is not None and expected.felt and self.leaps.before is None
+        agrees = goes_on and expected is not None and expected.felt and self.leaps.before is None
+        felt = self.felt.proven if agrees and self.felt is not None else 0.0
         return 0.5 * self.standing.wrong(share, goes_on=goes_on, felt=felt)
 
     def follow(self, t_ns: int, T_ref_cur: Array, share: float, expected: Expected | None, *, goes_on: bool) -> Array:

@@ -134,21 +134,21 @@ def test_the_more_of_the_image_a_motion_explains_the_surer_it_is(first: float, s
     standing = Standing()
     for share in (first, second):
         standing.follow(share, np.zeros(6), 0.1, goes_on=True)
-    few, many = (standing.wrong(s, goes_on=True, felt=False) for s in sorted((first, second)))
+    few, many = (standing.wrong(s, goes_on=True, felt=0.0) for s in sorted((first, second)))
     assert 0.0 < many <= few < 1.0
-    assert standing.wrong(first, goes_on=True, felt=True) < standing.wrong(first, goes_on=True, felt=False)
+    assert standing.wrong(first, goes_on=True, felt=1.0) < standing.wrong(first, goes_on=True, felt=0.5)
 
 
 def test_half_of_the_image_tells_nothing_and_what_was_explained_before_is_remembered():
-    assert Standing().wrong(0.5, goes_on=True, felt=False) == pytest.approx(0.5)
+    assert Standing().wrong(0.5, goes_on=True, felt=0.0) == pytest.approx(0.5)
     standing = Standing()
     for _ in range(50):
         standing.follow(0.95, np.zeros(6), 0.1, goes_on=True)
-    assert standing.wrong(0.5, goes_on=True, felt=False) < 0.1
-    assert standing.wrong(0.5, goes_on=False, felt=False) == pytest.approx(0.5)  # another motion begins anew
+    assert standing.wrong(0.5, goes_on=True, felt=0.0) < 0.1
+    assert standing.wrong(0.5, goes_on=False, felt=0.0) == pytest.approx(0.5)  # another motion begins anew
     for _ in range(200):
         standing.follow(0.4, np.zeros(6), 0.1, goes_on=True)
-    assert standing.wrong(0.4, goes_on=True, felt=False) > 0.6
+    assert standing.wrong(0.4, goes_on=True, felt=0.0) > 0.6
 
 
 def test_what_was_not_seen_has_any_velocity_that_the_vehicle_had():
@@ -185,16 +185,16 @@ def test_traffic_is_never_called_ok_and_is_covered(tmp_path, seed, with_imu):
     assert (locked & (wrong_m > 6 * sigma_m)).sum() <= 0.05 * locked.sum()
 
 
-@pytest.mark.parametrize("seed", [205, 220])
-def test_an_imu_tells_a_car_that_sets_off_with_the_vehicle(tmp_path, seed):
+@pytest.mark.parametrize(("seed", "least_ok"), [(32, 30), (205, 50), (220, 50)])
+def test_an_imu_tells_a_car_that_sets_off_with_the_vehicle(tmp_path, seed, least_ok):
     """The first acceleration that the IMU ever feels; the image follows the other car without a leap, or for longer
-    than the velocity before it had lasted."""
+    than the velocity before it had lasted. On the first flight the IMU takes it for gravity, and proves nothing."""
     path = simulate_points("street-traffic", seed, duration_s=40.0).save(tmp_path / "a.npz")
     source, config = open_source(path), make_config(max_acceleration_mps2=12.0, max_turn_radps2=20.0)
     log = VoLog([step.record for step in steps(source, config)], source.camera)
     wrong_m, ok, sigma_m = wrong_and_ok(log, source.truth)
     locked = wrong_m > 0.3
-    assert ok.sum() > 50
+    assert ok.sum() > least_ok
     assert locked.sum() > 20
     assert not (locked & ok).any()
     assert not any("moved against one another" in record.reason for record in log)  # they did not
