@@ -95,18 +95,15 @@ def test_a_test_flight_that_taught_is_refused(tmp_path: Path) -> None:
 
 @pytest.mark.slow
 def test_learned_covariance_beats_the_best_constant_where_vo_fails_for_seconds(tmp_path: Path) -> None:
-    """A tenth of the full experiment, hence wide bounds; the full one found 40 % and NEES within [0.7, 1.5]."""
+    """A third of the full experiment, hence wide bounds; the full one found 40 % and NEES within [0.7, 1.5]."""
     campaign = Campaign("tunnel-bursts", tmp_path, 30.0)
-    training, test = training_runs(campaign, 6), unseen_runs(campaign, 6)
+    training, test = training_runs(campaign, 6), unseen_runs(campaign, 18)
     outcome = experiment("small", training, test, trained(training, tmp_path / "m.gpvo"), hindsight=False)
     assert (outcome.rise.standard_deviation > 6).all()
     study = outcome.study
     for other in ("constant", "constant_best", "pointing_matching", "triangulation"):
         assert study.mean("learned", "ate_rmse_m") < study.mean(other, "ate_rmse_m")
     assert study.compare("learned", "constant_best").gain_percent > 10
-    for part in ("position", "attitude"):  # six flights spread by half of their mean: the 95 % interval of it
-        nees = study.column("learned", f"nees_{part}")
-        margin = 2.57 * nees.std(ddof=1) / np.sqrt(len(nees))
-        assert nees.mean() + margin > 0.5
-        assert nees.mean() - margin < 2.0
+    for part in ("position", "attitude"):
+        assert 0.4 < study.mean("learned", f"nees_{part}") < 2.5
     assert not any(np.nansum(study.column(name, "diverged")) for name in study.scores)
