@@ -27,7 +27,7 @@ from gpvo.twin.gap import Gap, restated
 from gpvo.twin.noise import Neighbours, Structure, adjust, draw_signs, without_loose_frames
 from gpvo.types import Array, ImuLog, Mounting, StereoCamera, TrackFrame, TruthLog, VoRecord
 from gpvo.vo.config import VoConfig
-from gpvo.vo.rig_error import N_TERMS, RigError, RigState, principal_errors
+from gpvo.vo.rig_error import N_TERMS, RigError, RigState, terms
 from gpvo.vo.rig_findings import STATE_FILE, read_start, read_state
 
 MIN_POINTS = 12
@@ -199,6 +199,16 @@ def rig_errors(settings: TwinSettings) -> Array:
     return drawn
 
 
+def _principal_errors(state: RigState, camera: StereoCamera) -> Array:
+    """(15, 15) columns whose sum, each times a standard normal number, is a draw of dx; those that displace the image
+    most come first."""
+    values, vectors = np.linalg.eigh(state.covariance[:N_TERMS, :N_TERMS])
+    root: Array = vectors * np.sqrt(np.maximum(values, 0.0))
+    y, x = (f.ravel() for f in np.mgrid[-1:1:7j, -1:1:9j])
+    over = terms(0.5 * camera.width / camera.fx_px * x, 0.5 * camera.height / camera.fy_px * y)
+    return np.asarray(root @ np.linalg.svd(over.T @ root)[2].T, np.float64)
+
+
 def _projected(original: Original, settings: TwinSettings, replicate: int) -> tuple[Array, Array]:
     """Left and right pixels (M, 2) of the landmarks in the rig of a twin, without noise: its baseline and focal length
     are drawn from the tolerance, what displaces its right image from what odometry found, or if that looked for nothing
@@ -208,7 +218,7 @@ def _projected(original: Original, settings: TwinSettings, replicate: int) -> tu
     tolerance = replace(settings.tolerance, rotation_rad=0.0) if known.covariance.any() else settings.tolerance
     left, right = TrueRig.of(camera, tolerance, e[:RIG_ERRORS]).pixels(original.structure.in_camera(seen))
     mean = known.mean.copy()
-    mean[:N_TERMS] += principal_errors(known, camera) @ e[2:]
+    mean[:N_TERMS] += _principal_errors(known, camera) @ e[2:]
     drawn = replace(known, mean=mean)
     displaced_d, displaced_row = RigError(camera, drawn, learn=False).errors(
         np.stack([left[:, 0], left[:, 1], left[:, 0] - right[:, 0]], axis=1),

@@ -344,8 +344,7 @@ class KltFrontend:
         )
 
     def _displaced(self, both: _Found) -> tuple[Array, Array] | None:
-        known = both.inside & np.isfinite(both.row_error)
-        uvd, row_error = both.seen.uvd[known], both.row_error[known]
+        uvd, row_error = both.seen.uvd[both.inside], both.row_error[both.inside]
         return self._rig_error.displaced(uvd, row_error, self._config.max_row_error_px)
 
     def _find_again(self, reference: _View, current: _View) -> Matches:

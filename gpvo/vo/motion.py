@@ -93,7 +93,7 @@ def transfer(T_prev_cur: Array, uvd_prev: Array, camera: StereoCamera) -> Transf
     return Transfer(uvd, H, G, m[2], in_front)
 
 
-AT_REST = np.zeros(6)
+NO_TWIST = np.zeros(6)
 
 
 def right_velocity(twist: Array, uvd: Array, camera: StereoCamera, late_s: float = 0.0) -> Array:

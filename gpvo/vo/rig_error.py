@@ -38,7 +38,7 @@ from numpy.typing import NDArray
 from gpvo.stats.series import median
 from gpvo.types import Array, StereoCamera
 from gpvo.vo.covariance import Blocks, Sums
-from gpvo.vo.motion import AT_REST, Motion, Whitened, apply_whitener, persistent_direction, right_velocity
+from gpvo.vo.motion import NO_TWIST, Motion, Whitened, apply_whitener, persistent_direction, right_velocity
 
 _HIGHEST = 4  # order
 POWERS = np.array([(n - j, j) for n in range(_HIGHEST + 1) for j in range(n + 1)])  # of x and y, order by order
@@ -99,16 +99,6 @@ def prior_covariance(camera: StereoCamera, mounting: float = 1.0, lens: float = 
     return np.diag(free**2) + _TURN_RAD**2 * turns
 
 
-def principal_errors(state: RigState, camera: StereoCamera) -> Array:
-    """(15, 15) columns whose sum, each times a standard normal number, is a draw of dx; those that displace the image
-    most come first."""
-    values, vectors = np.linalg.eigh(state.covariance[:N_TERMS, :N_TERMS])
-    root: Array = vectors * np.sqrt(np.maximum(values, 0.0))
-    y, x = (f.ravel() for f in np.mgrid[-1:1:7j, -1:1:9j])
-    over = terms(0.5 * camera.width / camera.fx_px * x, 0.5 * camera.height / camera.fy_px * y)
-    return np.asarray(root @ np.linalg.svd(over.T @ root)[2].T, np.float64)
-
-
 @dataclass(frozen=True)
 class RigState:
     """Coefficients as known: ``mean`` (31,) and ``covariance`` (31, 31), of dx, then of dy, each in the order of
@@ -147,7 +137,7 @@ class RigError:
     """
 
     def __init__(self, camera: StereoCamera, known: RigState | None = None, *, learn: bool = True) -> None:
-        self._camera, self.moved, self.twist = camera, 0, AT_REST
+        self._camera, self.moved, self.twist = camera, 0, NO_TWIST
         self.state = known or RigState.prior(camera)
         # What is right beyond doubt stays so.
         self._learn = learn and bool(self.state.covariance.any())
@@ -182,22 +172,29 @@ class RigError:
         """(N,) whether disparity and row of a match are possible, given what is known and what is not."""
         with np.errstate(invalid="ignore"):
             d_expected, row_expected = self.errors(uvd)
-            phi = np.concatenate([self._at(uvd), right_velocity(self.twist, uvd, self._camera)[1:]])
-            sigma = self._camera.fy_px * np.sqrt((phi * (self.state.covariance[N_TERMS:, N_TERMS:] @ phi)).sum(0))
             d = uvd[:, 2] - d_expected
-            rows = np.abs(row_error - row_expected) <= max_row_error_px + 3.0 * sigma
+            rows = np.abs(row_error - row_expected) <= max_row_error_px + self._rows_known_px(uvd)
             return (d >= min_disparity_px) & (d <= max_disparity_px) & rows
+
+    def _rows_known_px(self, uvd: Array) -> Array:
+        """(N,) to how many pixels the rows of measurements (N, 3) are known: three standard deviations."""
+        phi = np.concatenate([self._at(uvd), right_velocity(self.twist, uvd, self._camera)[1:]])
+        variance = (phi * (self.state.covariance[N_TERMS:, N_TERMS:] @ phi)).sum(0)
+        return np.asarray(3.0 * (self._camera.fy_px * np.sqrt(variance)))
 
     def displaced(self, uvd: Array, row_error: Array, max_row_error_px: float) -> tuple[Array, Array] | None:
         """Measurements (m, 3) and row errors (m,) of the points that lie as many rows too low or too high alike: where
-        most do, and a tenth of these is not allowed for it. Those that are would not say how many rows."""
-        if not len(uvd):
-            return None
+        most do, and a tenth of these is not allowed for it. Those that are would not say how many rows. A point with a
+        number that is not finite is none."""
+        known = np.isfinite(uvd).all(axis=1) & np.isfinite(row_error)
+        uvd, row_error = uvd[known], row_error[known]
         off = row_error - self.errors(uvd)[1]
         alike = np.abs(off - median(off)) <= max_row_error_px
-        uvd, row_error = uvd[alike], row_error[alike]
-        near = self.allows(uvd, row_error, -np.inf, np.inf, max_row_error_px)
-        return None if 2 * len(uvd) < len(off) or near.mean() >= _UNDISPLACED else (uvd, row_error)
+        off, uvd, row_error = off[alike], uvd[alike], row_error[alike]
+        if not len(off) or 2 * len(off) < len(alike):
+            return None
+        near = np.abs(off) <= max_row_error_px + self._rows_known_px(uvd)
+        return None if near.mean() >= _UNDISPLACED else (uvd, row_error)
 
     def update(
         self,
@@ -209,7 +206,7 @@ class RigError:
         displaced: tuple[Array, Array] | None = None,
         disputed: bool = False,
         sharp: bool = True,
-        twists: tuple[Array, Array] = (AT_REST, AT_REST),
+        twists: tuple[Array, Array] = (NO_TWIST, NO_TWIST),
     ) -> Array:
         """Learn from a motion over corrected measurements and its whitened residuals; its inliers have these row errors
         (M,), which do not count where all points of the image are ``displaced``. Where the images are not equally

@@ -16,7 +16,7 @@ from gpvo.types import Array, ImuMoments, StereoCamera, StereoFrame, TrackFrame
 from gpvo.vo.config import VoConfig
 from gpvo.vo.felt import Felt
 from gpvo.vo.frontend import Observation
-from gpvo.vo.motion import AT_REST
+from gpvo.vo.motion import NO_TWIST
 from gpvo.vo.rivals import EXPLAINED, Choice, Expected, Leaps, Standing
 
 _GUESS_S = 0.5  # for so long a velocity is taken to last
@@ -73,7 +73,7 @@ class State:
     t_refused_ns: int = 0
     jitter: Jitter = field(default_factory=Jitter)
     felt: Felt | None = None  # None without an IMU in a known place
-    twists: tuple[Array, Array] = (AT_REST, AT_REST)  # per second, at the reference and at the last believed frame
+    twists: tuple[Array, Array] = (NO_TWIST, NO_TWIST)  # per second, at the reference and at the last believed frame
 
     @classmethod
     def begin(cls, t_ns: int, points: int, T_imu_cam: Array | None) -> State:
@@ -235,7 +235,7 @@ class State:
         """Velocities (6,) per second at the reference and at ``t_ns``, for this motion between them: from one step to
         the next they change evenly."""
         now = self._velocity(t_ns, T_ref_cur)
-        change = 0.5 * (now - self.twist) if self.t_twist_ns == self.t_believed_ns else AT_REST
+        change = 0.5 * (now - self.twist) if self.t_twist_ns == self.t_believed_ns else NO_TWIST
         return now - change if self.t_ref_ns == self.t_believed_ns else self.twists[0], now + change
 
     def _velocity(self, t_ns: int, T_ref_cur: Array) -> Array:
@@ -262,7 +262,7 @@ class State:
 
     def restart(self, t_ns: int, points: int) -> None:
         """The frame at ``t_ns`` is the new reference."""
-        self.twists = (self.twists[1] if t_ns == self.t_believed_ns else AT_REST, AT_REST)
+        self.twists = (self.twists[1] if t_ns == self.t_believed_ns else NO_TWIST, NO_TWIST)
         self.t_ref_ns = self.t_believed_ns = self.t_last_ns = t_ns
         self.T_ref_believed = np.eye(4)
         self.parallax_from_reference_px = 0.0
