@@ -9,6 +9,7 @@ not given, are estimated from the residuals of motions.
 
 from __future__ import annotations
 
+from collections import deque
 from collections.abc import Callable
 from dataclasses import dataclass
 
@@ -39,6 +40,7 @@ from gpvo.vo.points import (
 )
 
 _MEMORY = 0.97  # of the running mean: about thirty frames
+_MOTIONS = 15  # of which the scale of the noise is the median: one bad one does not count
 _PARTS = 4, 2  # columns and rows of the image: finer ones see less of what neighbours share, coarser ones the same
 _CUT = 12.0  # squares of three degrees of freedom: against outliers
 _TEXTBOOK = 100.0 * np.array([[1.0, -1.0], [-1.0, 1.0]])  # prior of equal variance and covariance, worth 300 points
@@ -254,7 +256,8 @@ class DesignEffect:
 
 
 class NoiseEstimator:
-    """Running estimate of the form of the points' noise, :class:`gpvo.vo.points.PointNoise`.
+    """Running estimate of the points' noise: its form, :class:`gpvo.vo.points.PointNoise`, and its usual ``scale_px``,
+    the median of the last motions' (0 before any).
 
     ``shared`` solves two equations, those of u and d, for the variance of an image coordinate and the covariance of the
     two. What persists shows as the flow that it predicts wrongly: more scatter along ``g``, the residual's derivative
@@ -265,10 +268,13 @@ class NoiseEstimator:
         self._normal: Array = np.zeros((2, 2))
         self._moments: Array = np.zeros(2)
         self._sums: Array = np.zeros(3)
-        self.value = PointNoise()
+        self._scales_px: deque[float] = deque(maxlen=_MOTIONS)
+        self.value, self.scale_px = PointNoise(), 0.0
 
     def update(self, motion: Motion, white: Whitened) -> None:
         """Take in a motion and its whitened residuals."""
+        self._scales_px.append(motion.scale_px)
+        self.scale_px = median(np.array(self._scales_px))
         self.value = PointNoise(self._shared(motion, white), self.value.persistent)
         self.value = PointNoise(self.value.shared, self._persistent(motion.residuals, white.moved.G))
 

@@ -204,22 +204,23 @@ def whitened(motion: Motion, camera: StereoCamera) -> Whitened:
 
 # Iterations in which the inliers may change; then they stand, or a point on the fence would keep the estimate moving.
 _CHOOSING = 6
-# Of the motion's standard deviation: a last step so small has come to rest. With few points, each step leaves most of
-# what the one before had left; where two motions explain them, the estimate may leave one for the other after 20 steps.
-_AT_REST = 0.01
+# Of the motion's standard deviation: a step so small has come to rest. With few or noisy points, each leaves most of
+# what the one before had left: from the twelfth on, that is enough, and a step as large as the deviation leads away.
+_AT_REST, _PATIENCE = 0.01, 12
 # In the first of them, points that tell the translation choose alone: far ones agree with any, and would make good near
 # ones look like outliers.
 _NEAR_FIRST, _ENOUGH = 2, 8
 _PLAIN = PointNoise()
 
 
+@np.errstate(divide="ignore", invalid="ignore")  # a point at the camera's centre has no weight, and is no inlier
 def refine(
     T_start: Array,
     uvd_prev: Array,
     uvd_cur: Array,
     camera: StereoCamera,
     *,
-    max_iterations: int = 12,
+    max_iterations: int = 40,
     robust: bool = True,
     noise: PointNoise = _PLAIN,
     tolerance_px: float = np.inf,
@@ -270,11 +271,11 @@ def refine(
         # What is left of the residual is shared between the two frames: S G^T C^-1 (r - H step).
         left = z - np.einsum("ijn,j->in", A, step)
         smoothed = uvd_prev + _smoothing(S, moved.G, W, left, persistent)
-        converged = bool(step @ information @ step < (_AT_REST * scale) ** 2)
-        if np.abs(step).max() < 1e-9 or (
-            (iteration > _CHOOSING or chosen_px is not None) and np.abs(step).max() < 1e-6
-        ):
-            converged = True
+        deviations = float(np.sqrt(step @ information @ step)) / scale
+        stands = iteration > _CHOOSING or chosen_px is not None
+        done = bool(np.abs(step).max() < (1e-6 if stands else 1e-9))
+        converged = done or deviations < _AT_REST
+        if done or (iteration >= _PATIENCE and not _AT_REST <= deviations < 1.0):
             break
     return Motion(T, keep, scale, r[:, keep].T, smoothed[keep], information, converged, noise)
 

@@ -35,6 +35,7 @@ from gpvo.vo.state import State, Stopwatch, own_frame
 from gpvo.vo.window import Window
 
 _RIVAL_STAYS = 0.85  # per frame
+_NEAR = 3.0  # standard deviations of the noise that the last motions had
 _SAME = 0.01  # of the noise: what displaces all points alike by less is less than their mean is known to
 
 
@@ -171,6 +172,11 @@ class StereoOdometry:
         clock.lap("rematch")
         return matches, motion
 
+    @property
+    def _near_px(self) -> float:
+        """How far a point of the scene may be from where a motion puts it."""
+        return max(self.config.ransac_threshold_px, _NEAR * self._noise.scale_px)
+
     def _match(self, guess: Array, *, from_scratch: bool = False) -> Matches:
         """Matches of the front end, freed from what is known of the rig's errors."""
         assert self._frontend is not None
@@ -213,16 +219,17 @@ class StereoOdometry:
             return None, Choice()
         motion, held = untangled(motion, matches, self.camera, self._estimate)
         self.pair.note("held", held)
-        shares = [explained(motion, matches, self.camera, self.config)]
-        free = unexplained(motion, shares[0], matches, self.camera, self.config)
+        near_px, margin_px = self._near_px, self.config.klt_window_px
+        shares = [explained(motion, matches, self.camera, near_px, margin_px)]
+        free = unexplained(motion, shares[0], matches, self.camera, near_px)
         second = None if free is None else self._estimate(matches, free)
-        covered = (1, 0) if second is None else areas(motion, second, matches, self.camera, self.config)
+        covered = (1, 0) if second is None else areas(motion, second, matches, self.camera, near_px)
         state.rivalry = _RIVAL_STAYS * state.rivalry + float(covered[1] > 0)
         motions = [motion]
         if second is not None and covered[1] > 0:
             state.rival = motion.inliers | second.inliers
             motions.append(second)
-            shares.append(explained(second, matches, self.camera, self.config))
+            shares.append(explained(second, matches, self.camera, near_px, margin_px))
             doubts.append(f"two motions, over {covered[0]} and {covered[1]} parts of the image")
         elif state.rivalry > 1.5:
             doubts.append("two motions in the frames before")
@@ -253,7 +260,7 @@ class StereoOdometry:
 
     def _estimate(self, matches: Matches, among: NDArray[np.bool_] | None = None) -> Motion | None:
         """P3P in RANSAC on the left image, then the weighted refinement over both; of the points ``among``, (N,)."""
-        camera, config = self.camera, self.config
+        camera, config, near_px = self.camera, self.config, self._near_px
         among = matches.strong if among is None else among
         near = among & (matches.uvd_prev[:, 2] > TELLING_PX)
         if near.sum() < config.min_inliers:
@@ -262,13 +269,13 @@ class StereoOdometry:
             triangulate(matches.uvd_prev[near], camera),
             matches.uvd_cur[near, :2],
             camera.K,
-            config.ransac_threshold_px,
+            near_px,
             config.ransac_iterations,
             config.seed,
         )
         if found is None:
             return None
-        T_prev_cur, tolerance_px = se3.inverse(found), 2 * config.ransac_threshold_px
+        T_prev_cur, tolerance_px = se3.inverse(found), 2 * near_px
         if (among & agrees(T_prev_cur, matches, camera, tolerance_px)).sum() < config.min_inliers:
             return None
         uvd_prev, uvd_cur = matches.uvd_prev[among], matches.uvd_cur[among]

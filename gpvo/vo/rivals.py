@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 
 from gpvo.geometry import se3
 from gpvo.types import Array, StereoCamera
-from gpvo.vo.config import KNOWN_DEPTH_PX, VoConfig
+from gpvo.vo.config import KNOWN_DEPTH_PX
 from gpvo.vo.frontend import Matches
 from gpvo.vo.motion import Motion, predict_uvd
 from gpvo.vo.quality import worst_translation_sigma_m
@@ -240,20 +240,20 @@ def cells(uv: NDArray[np.floating[Any]], camera: StereoCamera) -> NDArray[np.int
 
 
 def unexplained(
-    motion: Motion, share: float, matches: Matches, camera: StereoCamera, config: VoConfig
+    motion: Motion, share: float, matches: Matches, camera: StereoCamera, near_px: float
 ) -> NDArray[np.bool_] | None:
-    """(N,) the points, spare ones too, that moved otherwise; None where the ``share`` that the motion explains is most
-    of the image."""
+    """(N,) the points, spare ones too, that moved otherwise, by over ``near_px``; None where the ``share`` that the
+    motion explains is most of the image."""
     if share >= EXPLAINED:
         return None
     off_px = _off_px(motion.T_prev_cur, matches, camera)
-    free = (matches.uvd_prev[:, 2] > KNOWN_DEPTH_PX) & (off_px > max(config.ransac_threshold_px, 6 * motion.scale_px))
+    free = (matches.uvd_prev[:, 2] > KNOWN_DEPTH_PX) & (off_px > max(near_px, 6 * motion.scale_px))
     return free if free.sum() >= _LEAST else None
 
 
-def explained(motion: Motion, matches: Matches, camera: StereoCamera, config: VoConfig) -> float:
+def explained(motion: Motion, matches: Matches, camera: StereoCamera, near_px: float, margin_px: float) -> float:
     """Share of the cells with points of the reference, but for those that the motion puts out of sight, in which one
-    agrees; 1 where they are not known.
+    agrees to ``near_px``; 1 where they are not known. ``margin_px`` of the image's border, points are not found.
 
     Points at infinity do not count: they agree with any translation.
     """
@@ -261,11 +261,10 @@ def explained(motion: Motion, matches: Matches, camera: StereoCamera, config: Vo
         return 1.0
     off_px = _off_px(motion.T_prev_cur, matches, camera)
     (u, v, d), in_front = predict_uvd(motion.T_prev_cur, matches.sought_uvd, camera)
-    margin = config.klt_window_px
-    inside = (u - d > margin) & (u < camera.width - margin) & (v > margin) & (v < camera.height - margin)
+    inside = (u - d > margin_px) & (u < camera.width - margin_px) & (v > margin_px) & (v < camera.height - margin_px)
     tells, told = (uvd[:, 2] > KNOWN_DEPTH_PX for uvd in (matches.sought_uvd, matches.uvd_prev))
     sought = np.unique(cells(matches.sought_uvd[in_front & inside & tells], camera))
-    agree = np.isin(sought, cells(matches.uvd_prev[(off_px < config.ransac_threshold_px) & told], camera))
+    agree = np.isin(sought, cells(matches.uvd_prev[(off_px < near_px) & told], camera))
     return float(agree.sum() / max(len(sought), 1))
 
 
@@ -298,16 +297,16 @@ def untangled(
     return (motion, False) if freed is None else (freed, True)
 
 
-def areas(first: Motion, second: Motion, matches: Matches, camera: StereoCamera, config: VoConfig) -> tuple[int, int]:
-    """Cells of the image in which each of two motions explains points better than the other does.
+def areas(first: Motion, second: Motion, matches: Matches, camera: StereoCamera, near_px: float) -> tuple[int, int]:
+    """Cells of the image in which each of two motions explains points to ``near_px``, and better than the other does.
 
     The second has none where it is that of an object, or a chance agreement: that is loose, as any place within the
     threshold is as likely.
     """
     off_px = np.stack([_off_px(m.T_prev_cur, matches, camera) for m in (first, second)])
-    close = (off_px < config.ransac_threshold_px) & (off_px == off_px.min(axis=0))
+    close = (off_px < near_px) & (off_px == off_px.min(axis=0))
     n_first, n_second = (len(np.unique(cells(matches.uvd_cur[c], camera))) for c in close)
-    loose = second.scale_px > max(2 * first.scale_px, 0.25 * config.ransac_threshold_px)
+    loose = second.scale_px > max(2 * first.scale_px, 0.25 * near_px)
     chance = loose or second.inliers.sum() < _LEAST or n_second < _SHARE * n_first
     return n_first, 0 if chance else n_second
 
