@@ -20,7 +20,7 @@ MIN_ROTATION_RAD = 0.02
 _LONGEST_S = 1.0  # of a motion, unless frames are slower
 _MIN_POINTS = 5  # of a cubic
 _LATEST_S, _STEP_S = 0.2, 0.005  # shifts of the clock that are tried
-_SHIFT_S = 0.02  # below, a filter hardly notices
+_SHIFT_S = 1.5 * _STEP_S  # one step may be chance
 _MIN_CORRELATION = 0.7
 _LESS_UNEXPLAINED = 0.7  # of the variance, as a factor
 

@@ -26,6 +26,7 @@ _FORGET = 0.02
 # truth may be interpolated, or a stretch be judged whole, is asked of slower data (dataset.errors, filters.start).
 _GAP_FACTOR, GAP_S = 5.0, 0.05
 _NEARBY = 1000  # samples that tell how far a guess over a gap may be off
+_SATURATED, _NEIGHBOURS = 10, 5  # readings at the end of a range, and the values next to it that are far rarer
 
 
 class ImuGuard:
@@ -86,6 +87,18 @@ def usable(imu: ImuLog) -> NDArray[np.bool_]:
     return on_one_clock(imu.t_ns, good)
 
 
+def saturated(imu: ImuLog) -> NDArray[np.bool_]:
+    """(N,) which samples of a log stop at the end of a sensor's range, on any axis: the largest reading is far commoner
+    than those next to it. What was felt is more than they say."""
+    at_end = np.zeros(len(imu.t_ns), bool)
+    for column in np.abs(np.concatenate([imu.gyro_radps, imu.acc_mps2], axis=1)).T:
+        values, counts = np.unique(column[np.isfinite(column)], return_counts=True)
+        next_to = counts[-1 - _NEIGHBOURS : -1]
+        if len(next_to) == _NEIGHBOURS and counts[-1] >= max(_SATURATED, _NEIGHBOURS * next_to.max()):
+            at_end |= column == values[-1]
+    return at_end
+
+
 def on_one_clock(t_ns: NDArray[np.int64], good: NDArray[np.bool_]) -> NDArray[np.bool_]:
     """Those of the ``good`` samples (N,) whose stamps (N,) grow; one far ahead is left out, not those after it."""
     if len(t_ns) < 2:
@@ -128,10 +141,10 @@ class Samples:
         return bool(self.t_ns) and self.t_ns[-1] >= t_ns
 
     def drop_before(self, t_ns: int) -> None:
-        """Forget what comes before the last one at or before ``t_ns``, once that is a thousand or more."""
-        keep = bisect.bisect_right(self.t_ns, t_ns) - 1
-        if keep > 1000:
-            del self.t_ns[:keep], self.values[:keep]
+        """Forget what comes before the last one at or before ``t_ns``, but for those nearby, once that is as many."""
+        old = bisect.bisect_right(self.t_ns, t_ns) - 1 - _NEARBY
+        if old > _NEARBY:
+            del self.t_ns[:old], self.values[:old]
 
     def shortest_gap_s(self, i: int) -> float:
         """Of an interval near sample i, from which on samples are missing."""

@@ -13,7 +13,7 @@ from gpvo.errors import NO_TRUTH, GpvoError
 from gpvo.filters import metrics
 from gpvo.filters.eskf import ErrorStateFilter
 from gpvo.filters.measurement import Gate
-from gpvo.filters.plausible import usable
+from gpvo.filters.plausible import saturated, usable
 from gpvo.filters.policies import Policy
 from gpvo.filters.propagation import DEFAULT_IMU_NOISE, TH, P, constant_velocity_noise, each
 from gpvo.filters.rivals import Step, outcome_of
@@ -290,7 +290,8 @@ def _fly(
     index = {t: i for i, t in enumerate(VoLog(flight.records).t_ns.tolist())}
     done: dict[int, int] = {}
     imu = flight.imu
-    samples = iter(()) if imu is None else zip(imu.t_ns, imu.gyro_radps, imu.acc_mps2)
+    heard = slice(0) if imu is None else ~saturated(imu)
+    samples = iter(()) if imu is None else zip(imu.t_ns[heard], imu.gyro_radps[heard], imu.acc_mps2[heard])
     for k, record in enumerate(map(flight.records.__getitem__, rows.tolist())):
         if k % _TOLD_EACH == 0:
             progress(f"{flight.name}: frame {k} of {len(rows)}")

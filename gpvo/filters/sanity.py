@@ -20,7 +20,7 @@ from gpvo.filters.imu_motion import (
     clock_shift,
     jerks,
 )
-from gpvo.filters.plausible import on_one_clock, usable
+from gpvo.filters.plausible import on_one_clock, saturated, usable
 from gpvo.filters.run import Flight
 from gpvo.filters.start import StartSigmas
 from gpvo.geometry import se3
@@ -35,6 +35,7 @@ _RELABELLINGS = sorted(
 _AXES_WINDOW_S = 10.0
 _TOGETHER = 0.7  # correlation of all rotations from which names of axes are not chance
 _APART_DEG, _EXPLAINED, _TWO_AXES = 10.0, 0.25, 0.05
+_AS_WELL = 0.1  # correlations that differ by less say the same
 _MOST_BIAS = 4.0  # of the sigma that a filter starts with
 _WINDOWS_S, _MIN_WINDOWS = (2.0, 1.4, 1.0, 0.7), 5  # the first lengths of which a flight holds so many
 
@@ -111,6 +112,9 @@ def _samples(imu: ImuLog) -> Iterator[Finding]:
         every = bool(bad.mean() > 0.5)
         text = f"{int(bad.sum())} of {len(imu.t_ns)} IMU samples are not finite and are dropped"
         yield Finding("imu", text, "run without it: --no-imu" if every else "", fatal=every)
+    if n := int((saturated(imu) & usable(imu)).sum()):
+        text = f"{counted(n, 'IMU sample')} of {len(imu.t_ns)} at the end of the sensor's range, counted as missing"
+        yield Finding("saturated", text, "set a wider range", fatal=False)
     beyond = int((~bad & ~usable(imu)).sum())
     if 0 < beyond <= 0.5 * len(imu.t_ns):  # More than that are in another unit.
         text = f"IMU samples out of range or out of order, counted as missing: {beyond} of {len(imu.t_ns)}"
@@ -317,7 +321,8 @@ def _accelerometer_axes(imu: ImuLog) -> Iterator[Finding]:
 
 
 def _accelerometer_sign(flight: Flight, imu: ImuLog) -> Iterator[Finding]:
-    """With all axes turned around gravity stays put as well; but the force then falls where VO's motion rises.
+    """With all axes turned around gravity stays put as well, and in a vehicle that accelerates it does not stay put
+    anyway; but the force then does not rise and fall with VO's motion.
 
     Both are compared by their slopes, from which gravity and constant biases are gone. Of short windows, in which VO's
     noise weighs more, nothing fatal is said.
@@ -328,7 +333,20 @@ def _accelerometer_sign(flight: Flight, imu: ImuLog) -> Iterator[Finding]:
         return
     correlation = _rises_together(flight, imu, window_s)
     # By chance the correlation of n pairs of values deviates from zero by 1 / sqrt(n).
-    if correlation < -max(0.3, 3.0 / np.sqrt(3 * n)):
+    chance = max(0.3, 3.0 / np.sqrt(3 * n))
+    if correlation > 1.0 - chance:
+        return
+    renamed = [_rises_together(flight, replace(imu, acc_mps2=imu.acc_mps2 @ M.T), window_s) for M in _RELABELLINGS]
+    best = int(np.argmax(renamed))
+    is_clear = 1.0 - renamed[best] ** 2 < _EXPLAINED * (1.0 - correlation**2)
+    if is_clear and renamed[best] > max(correlation + chance, renamed[-1] + _AS_WELL):  # the last: all turned around
+        text = (
+            f"the accelerometer rises and falls with VO's motion only with its axes renamed to"
+            f" {_describe(_RELABELLINGS[best])} (correlation {renamed[best]:.2f}, as given {correlation:.2f})"
+        )
+        cure = "accelerometer and gyroscope axes differ: swapped axes"
+        yield Finding("acc_axes", text, cure, fatal=window_s == _WINDOWS_S[0])
+    elif correlation < -chance:
         flipped = (replace(imu, acc_mps2=imu.acc_mps2 * (1 - 2 * axis)) for axis in np.eye(3))
         shows = [name for name, one in zip("xyz", flipped) if _rises_together(flight, one, window_s) > 0.3]
         text = f"the accelerometer falls where VO's motion rises (correlation {correlation:.2f}): its sign is wrong"

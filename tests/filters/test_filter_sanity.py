@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 from gpvo.errors import GpvoError
 from gpvo.evaluation.flights import flight_of
+from gpvo.filters import sanity
 from gpvo.filters.imu_motion import clock_shift
 from gpvo.filters.policies import LearnedPolicy
 from gpvo.filters.run import Flight, fuse_flight
@@ -251,3 +252,26 @@ def test_the_shift_of_a_clock_is_found_where_the_vehicle_turns(late_s: float) ->
     # Of a vehicle that hardly turns nothing is told.
     straight = [replace(r, T_prev_cur=se3.from_rt(np.eye(3), r.T_prev_cur[:3, 3])) for r in flight.records]
     assert clock_shift(replace(flight, records=straight), shifted) is None
+
+
+@pytest.mark.parametrize("axes", [[1, 0, 2], [2, 0, 1]])
+def test_motion_tells_the_axes_of_an_accelerometer_where_gravity_does_not(
+    flight: Flight, axes: list[int], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """As in a vehicle that accelerates all the time."""
+    monkeypatch.setattr(sanity, "_accelerometer_axes", lambda imu: iter(()))
+    assert check_flight(flight) == []
+    renamed = _with_imu(flight, lambda i: replace(i, acc_mps2=i.acc_mps2[:, axes]))
+    right = ", ".join("xyz"[axes.index(k)] for k in range(3))
+    with pytest.raises(GpvoError, match=re.escape(f"with its axes renamed to ({right})")):
+        require_sane(renamed)
+
+
+def test_a_small_shift_of_a_clock_is_found_where_the_odometry_is_good() -> None:
+    law = ErrorLaw(jitter=np.full(6, 1e-4), white=np.full(6, 1e-4), bias=np.full(6, 1e-5))
+    flight = synthetic_flight(2, duration_s=20, law=law)
+    assert flight.imu is not None
+    assert clock_shift(flight, flight.imu) is None
+    found = clock_shift(flight, replace(flight.imu, t_ns=flight.imu.t_ns + 12_000_000))
+    assert found is not None
+    assert found.shift_s == pytest.approx(0.012, abs=0.003)
