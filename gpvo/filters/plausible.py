@@ -27,6 +27,7 @@ _FORGET = 0.02
 _GAP_FACTOR, GAP_S = 5.0, 0.05
 _NEARBY = 1000  # samples that tell how far a guess over a gap may be off
 _SATURATED, _NEIGHBOURS = 10, 5  # readings at the end of a range, and the values next to it that are far rarer
+_LEAST_RANGE = 1.0, 15.0  # rad/s and m/s^2: no sensor ends below; a turn at one rate may, in a simulation without noise
 
 
 class ImuGuard:
@@ -91,11 +92,14 @@ def saturated(imu: ImuLog) -> NDArray[np.bool_]:
     """(N,) which samples of a log stop at the end of a sensor's range, on any axis: the largest reading is far commoner
     than those next to it. What was felt is more than they say."""
     at_end = np.zeros(len(imu.t_ns), bool)
-    for column in np.abs(np.concatenate([imu.gyro_radps, imu.acc_mps2], axis=1)).T:
-        values, counts = np.unique(column[np.isfinite(column)], return_counts=True)
-        next_to = counts[-1 - _NEIGHBOURS : -1]
-        if len(next_to) == _NEIGHBOURS and counts[-1] >= max(_SATURATED, _NEIGHBOURS * next_to.max()):
-            at_end |= column == values[-1]
+    for reading, least in zip((imu.gyro_radps, imu.acc_mps2), _LEAST_RANGE, strict=True):
+        for column in np.abs(reading).T:
+            values, counts = np.unique(column[np.isfinite(column)], return_counts=True)
+            next_to = counts[-1 - _NEIGHBOURS : -1]
+            if len(next_to) < _NEIGHBOURS or values[-1] < least:
+                continue
+            if counts[-1] >= max(_SATURATED, _NEIGHBOURS * next_to.max()):
+                at_end |= column == values[-1]
     return at_end
 
 

@@ -6,6 +6,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from gpvo.filters import plausible
 from gpvo.filters.plausible import Samples, saturated
 from gpvo.filters.policies import LearnedPolicy
 from gpvo.filters.run import Flight, fuse_flight
@@ -43,7 +44,8 @@ def clipped(flight: Flight, most_radps: float) -> Flight:
     return replace(flight, imu=ImuLog(imu.t_ns, gyro, imu.acc_mps2, imu.noise))
 
 
-def test_a_sensor_at_the_end_of_its_range_says_nothing() -> None:
+def test_a_sensor_at_the_end_of_its_range_says_nothing(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(plausible, "_LEAST_RANGE", (0.5, 15.0))  # the flight turns by no more
     flight = clipped(synthetic_flight(2, duration_s=15), 0.6)
     assert [f.kind for f in check_flight(flight)] == ["saturated"]
     scores = fuse_flight(flight, LearnedPolicy())[0].scores
@@ -64,3 +66,9 @@ def test_coarse_held_and_resting_readings_are_in_range(step: float) -> None:
     assert not saturated(ImuLog(np.arange(len(gyro)), gyro, acc)).any()
     rest = np.tile([0.0, 0.0, 0.01, 0.0, 0.0, 9.81], (500, 1)) + step * np.round(np.sin(np.arange(500)))[:, None]
     assert not saturated(ImuLog(np.arange(500), rest[:, :3], rest[:, 3:])).any()
+
+
+@pytest.mark.parametrize("most, expected", [(0.5, False), (4.0, True)])
+def test_a_steady_turn_without_noise_is_in_range(most: float, expected: bool) -> None:
+    gyro = np.minimum(np.linspace(0.0, 2.0 * most, 1000), most)[:, None] * [0.0, 0.0, 1.0]
+    assert saturated(ImuLog(np.arange(1000), gyro, np.full((1000, 3), 5.0))).any() == expected
