@@ -50,8 +50,8 @@ class Groups(TyperGroup):
 
 CovarianceAxes = Annotated[
     str,
-    "Axes of covariances of poses: world, body, mixed (those of the rotation alone are the body's), or auto: mixed for"
-    " columns of OpenVINS' names, else world.",
+    "Axes of covariances: world, body, mixed (those of the rotation alone are the body's), or auto: body for those of"
+    " motions; of poses, mixed for columns of OpenVINS' names, else world.",
 ]
 Config = Annotated[Path | None, "TOML file of options, one table per command. The command line takes precedence."]
 Quiet = Annotated[bool, "-q", "--quiet", "No progress and no notes."]

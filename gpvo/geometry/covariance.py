@@ -124,6 +124,13 @@ def change_body(T_new_old: Array, covariance: Array) -> Array:
     return A @ covariance @ np.swapaxes(A, -1, -2)
 
 
+def growth(covariance: Array, motions: Array) -> Array:
+    """(N, 6, 6) what motions (N - 1, 4, 4) add to the covariance of the pose before, (N, 6, 6); NaN for the first."""
+    out = np.full_like(covariance, np.nan)
+    out[1:] = symmetrise(covariance[1:] - change_body(se3.inverse(motions), covariance[:-1]))
+    return out
+
+
 def position_in_world(T_world_cur: Array, covariance: Array) -> Array:
     """(..., 3, 3) covariance of the position in world axes, from the right-perturbation (..., 6, 6)."""
     R = T_world_cur[..., :3, :3]

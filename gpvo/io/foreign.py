@@ -42,6 +42,7 @@ PLACES = {
 """Where the camera sits on what poses may be of."""
 # What a step adds to a variance, beyond rounding: of the variance, and of the least that is seen.
 _GROWS, _GROWS_SEEN = 1e-6, 1e-3
+GROWING = 0.95  # share of the steps in which the covariance of poses grows, if it is that of errors that add up
 _NAMED = 12  # columns in a remark
 MIXED_AXES = "the rotation's covariances are read as in the body's axes, as OpenVINS has them (--covariance-axes)"
 NONE_STATED = "its covariances are NaN or not positive definite and were left out"
@@ -169,8 +170,9 @@ def read_foreign(
     times, rate_hz : for KITTI poses, which have no stamps: a file with a line of seconds each, or the rate.
     covariance_of : what covariance columns of a CSV are of, ``"pose"`` (default) or ``"motion"``.
     complete : refuse rows of a CSV, or messages of a bag, without a pose, as of a ground truth; else they are counted.
-    covariance_axes : of covariances of poses: of the ``"world"``, as in ROS, the ``"body"``, or ``"mixed"``: those of
-        the rotation alone the body's, as in most filters; ``"auto"``: mixed for columns of OpenVINS' names, else world.
+    covariance_axes : of covariances: of the ``"world"``, as in ROS, the ``"body"``, or ``"mixed"``: those of the
+        rotation alone the body's, as in most filters; ``"auto"``: body for those of motions, of poses mixed for columns
+        of OpenVINS' names, else world.
     """
     p = Path(path)
     name = kind or guess_format(p)
@@ -197,7 +199,9 @@ def read_foreign(
 
 def _from_table(path: Path, table: Table, covariance_of: str, axes: str, complete: bool) -> ForeignLog:
     notes = [*table.notes]
-    if axes == "auto" and (axes := table.covariance_axes) == "mixed":
+    if axes == "auto" and covariance_of == "motion":
+        axes = "body"
+    elif axes == "auto" and (axes := table.covariance_axes) == "mixed":
         notes.append(MIXED_AXES)
     c = table.columns
     pose = np.stack([c[n] for n in ("p_x", "p_y", "p_z", "q_x", "q_y", "q_z", "q_w")], axis=1)
@@ -214,6 +218,8 @@ def _from_table(path: Path, table: Table, covariance_of: str, axes: str, complet
     trajectory = Trajectory(t, se3.from_quaternion(pose[:, :3], pose[:, 3:]))
     cov = _table_covariance(c, known)
     if cov is not None:
+        if covariance_of == "pose":
+            notes += other_axes(trajectory.T_world_body, cov, axes)
         cov = into_body(trajectory.T_world_body, cov, axes)
         still = still_axes(trajectory.T_world_body)
         stated = np.array([f"cov_{i}{i}" in c for i in range(6)])
@@ -262,6 +268,19 @@ def into_body(T_world_body: Array, covariance: Array, axes: str) -> Array:
         return covariance
     of_rotation = np.eye(3) if axes == "mixed" else None
     return se3.rotate_covariance(np.swapaxes(T_world_body[..., :3, :3], -1, -2), covariance, of_rotation)
+
+
+def other_axes(T_world_body: Array, covariance: Array, axes: str) -> list[str]:
+    """A remark where covariances (N, 6, 6) of poses (N, 4, 4) grow from row to row, as those of errors that add up do,
+    in other axes than those that they are read in."""
+    motions, shares = se3.inverse(T_world_body[:-1]) @ T_world_body[1:], dict[str, float]()
+    for name in COVARIANCE_AXES[1:] if len(motions) else ():
+        added = transport.growth(transport.symmetrise(into_body(T_world_body, covariance, name)), motions)
+        shares[name] = float(transport.are_covariances(added[1:]).mean())
+    best = max(shares, key=lambda name: shares[name], default=axes)
+    if shares.get(best, 0.0) < GROWING or shares[axes if axes != "auto" else "world"] >= GROWING:
+        return []
+    return [f"the covariances grow from row to row only if they are in other axes than read: --covariance-axes {best}"]
 
 
 def still_axes(T_world_body: Array) -> NDArray[np.bool_]:
@@ -338,7 +357,9 @@ def _read_bag_topic(path: Path, topic: str, axes: str, complete: bool) -> Foreig
     stated = (covariances_of(read, name) for name in ("twist", "pose"))
     twist, pose = (None if C is None else np.where(np.isfinite(C), C, np.nan) for C in stated)
     still = still_axes(T)
-    pose = None if pose is None else definite_in_plane(into_body(T, pose, axes), still)
+    if pose is not None:
+        notes += other_axes(T, pose, axes)
+        pose = definite_in_plane(into_body(T, pose, axes), still)
     twist = None if twist is None else definite_in_plane(twist, still)
     if twist is not None and _looks_stated(twist):
         # Of the velocity in the child frame over the step that ends at the stamp.

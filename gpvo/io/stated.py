@@ -23,11 +23,12 @@ from gpvo.geometry import se3
 from gpvo.geometry.covariance import (
     are_covariances,
     from_upper,
+    growth,
     is_positive_definite,
     symmetrise,
     upper,
 )
-from gpvo.io.foreign import NONE_STATED, ForeignLog, definite_in_plane, still_axes
+from gpvo.io.foreign import GROWING, NONE_STATED, ForeignLog, definite_in_plane, still_axes
 from gpvo.io.stamps import ns_to_seconds_text, seconds_text_to_ns, text_lines
 from gpvo.io.trajectory import Trajectory, read_tum_with, tum_line
 from gpvo.types import COUNT_FIELDS, IMPORTED, IMPORTED_POSE, Array, Status, VoLog, VoRecord
@@ -167,14 +168,12 @@ def _motion_covariances(log: ForeignLog, motions: Array) -> tuple[str, Array | N
         return "", None, [NONE_STATED]
     if log.covariance_of == "motion":
         return IMPORTED, C, _if_of_poses(C[1:], motions)
-    A = se3.adjoint(se3.inverse(motions))
-    growth = np.full_like(C, np.nan)
-    growth[1:] = symmetrise(C[1:] - A @ C[:-1] @ np.swapaxes(A, -1, -2))
+    added = growth(C, motions)
     still = still_axes(log.trajectory.T_world_body)
-    growth = definite_in_plane(growth, still, np.diagonal(C, axis1=1, axis2=2))
-    share = float(are_covariances(growth[1:]).mean()) if len(motions) else 0.0
-    if share >= 0.95:
-        return IMPORTED, growth, []
+    added = definite_in_plane(added, still, np.diagonal(C, axis1=1, axis2=2))
+    share = float(are_covariances(added[1:]).mean()) if len(motions) else 0.0
+    if share >= GROWING:
+        return IMPORTED, added, []
     other = "" if log.topic else " (if they are of single motions, --covariance-of motion)"
     note = (
         f"the covariances are of poses and grow in {100 * share:.0f} % of the steps only, as a filter's do: kept as"

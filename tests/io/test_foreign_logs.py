@@ -10,7 +10,7 @@ import pytest
 from foreign_trajectories import write_euroc_csv, write_kitti_poses
 from gpvo.cli.files import import_log
 from gpvo.errors import SourceError
-from gpvo.geometry import se3
+from gpvo.geometry import covariance, se3
 from gpvo.io.foreign import T_FLU_OPTICAL, check_same_rows, guess_format, read_foreign
 from gpvo.io.stamps import cure_of_seconds, likely_unit
 from gpvo.io.stated import to_records
@@ -183,9 +183,36 @@ def test_columns_by_mapping_with_counts_and_covariance(tmp_path):
 def test_world_axes_are_turned_into_the_body(tmp_path):
     header = "t_ns,p_x,p_y,p_z,q_x,q_y,q_z,q_w," + ",".join(f"cov_{i}{i}" for i in range(6))
     path = _csv(tmp_path / "a.csv", header, [[1e-4 * (i + 1)] * N for i in range(6)])
-    log = read_foreign(path, covariance_of="motion")
+    log = read_foreign(path, covariance_of="motion", covariance_axes="world")
     R = POSES[9, :3, :3]
     np.testing.assert_allclose(log.covariance[9][:3, :3], R.T @ np.diag([1e-4, 2e-4, 3e-4]) @ R, atol=1e-12)
+
+
+def test_covariances_of_motions_are_in_the_axes_of_the_body(tmp_path):
+    """What a motion knows is of the camera that saw it; read in the world's axes it was turned with the vehicle."""
+    header = "t_ns,p_x,p_y,p_z,q_x,q_y,q_z,q_w," + ",".join(f"cov_{i}{i}" for i in range(6))
+    path = _csv(tmp_path / "a.csv", header, [[1e-4 * (i + 1)] * N for i in range(6)])
+    stated = read_foreign(path, covariance_of="motion").covariance
+    np.testing.assert_allclose(stated, np.tile(np.diag(1e-4 * np.arange(1, 7)), (N, 1, 1)), atol=1e-12)
+
+
+@pytest.mark.parametrize(
+    ("written", "read", "remarked"),
+    [("body", "auto", True), ("world", "body", True), ("world", "auto", False), ("body", "body", False)],
+)
+def test_covariances_that_grow_in_other_axes_than_read_are_remarked(tmp_path, written, read, remarked):
+    """Errors that add up, as GTSAM states them, about axes of the body, and as ROS does, about those of the world."""
+    C = [1e-10 * np.eye(6)]
+    for k, motion in enumerate(MOTIONS):
+        added = np.diag([1e-4 if k < 3 else 1e-8, 1e-8, 1e-8, 1e-10, 1e-10, 1e-10])
+        C.append(covariance.compound(motion, C[-1], added))
+    stated = np.array(C) if written == "body" else se3.rotate_covariance(POSES[:, :3, :3], np.array(C))
+    names = [f"cov_{i}{j}" for i in range(6) for j in range(6)]
+    header = ",".join(["t_ns,p_x,p_y,p_z,q_x,q_y,q_z,q_w", *names])
+    path = _csv(tmp_path / "a.csv", header, np.reshape(stated, (N, 36)).T.tolist())
+    records, notes = to_records(read_foreign(path, covariance_axes=read))
+    assert set(records[5].covariances) == {"imported_pose" if remarked else "imported"}
+    assert any(f"--covariance-axes {written}" in note for note in notes) is remarked
 
 
 def test_pose_covariance_of_a_filter_is_not_passed_off_as_a_motions(tmp_path):
