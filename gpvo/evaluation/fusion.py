@@ -98,7 +98,8 @@ def fuse_runs(
             warnings += [f"{name}: the model does not fit: {problem}" for problem in check(stating, run).problems]
     if settings.use_imu and (without := [f.name for f in flights if f.imu is None]):
         which = "any run" if len(without) == len(flights) else ", ".join(without)
-        warnings.append(f"no IMU in {which}: a model of constant velocity stands in for it")
+        wide = "whose noise errs on the wide side, so NIS is low"
+        warnings.append(f"no IMU in {which}: a model of constant velocity stands in for it, {wide}")
     constants = _constants(settings, predictor, flights, options, tell)
     learned = any(f.predictions for f in flights)
     policies = make_policies(constants, names=settings.policies, learned=learned)

@@ -59,7 +59,7 @@ class Finding:
             yield cls(code, what, consequence, float(bad.mean()))
 
     def __str__(self) -> str:
-        part = "" if self.share >= 1.0 else f" ({100 * self.share:.0f} % of the messages)"
+        part = "" if self.share >= 1.0 else f" ({100 * self.share:.3g} % of the messages)"
         return f"{self.code}: {self.what}{part}\n    {self.consequence}"
 
 
