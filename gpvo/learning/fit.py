@@ -29,7 +29,11 @@ from gpvo.types import Array
 NONE = "none"
 """The choice of no inputs: the base variance alone."""
 
+BETWEEN = ", between sequences too"
+"""Behind the name of inputs by which also the levels of sequences are told."""
+
 MOST_FOLDS = 8
+_CLEARLY = 2.0  # standard errors
 
 
 @dataclass(frozen=True)
@@ -94,30 +98,44 @@ def choose_inputs(
 ) -> tuple[str, VarianceModel, dict[str, float]]:
     """The simplest set of inputs that no other beats by a significant gain in left-out groups; none is the simplest.
 
-    Returned by name, with the model, and the mean loss of each set [nats per axis].
+    Whether inputs also tell how noisy a whole sequence is, sequences left out must show clearly: few sequences differ
+    in many things by chance. Returned by name, with the model, and the mean loss of each set [nats per axis].
     """
-    tried = {NONE: alone}
-    for name, inputs in candidates(rows.sets, config).items():
+    tried, sets = {NONE: alone}, candidates(rows.sets, config)
+    for name, inputs in sets.items():
         tried[name] = fit_variance(rows, choice, inputs, alone.means)
     losses = {name: _losses(rows, model) for name, model in tried.items()}
     best = simplest_sufficient(losses)
+    if sets and rows.grouped_by == "sequences":
+        between = {name + BETWEEN: inputs for name, inputs in sets.items()}
+        tried |= {n: fit_variance(rows, choice, inputs, alone.means, between=True) for n, inputs in between.items()}
+        losses |= {name: _losses(rows, tried[name]) for name in between}
+        rival = simplest_sufficient({name: losses[name] for name in between})
+        best = rival if significant_gain(losses[best] - losses[rival], _CLEARLY) else best
     return best, tried[best], {name: float(loss.mean()) for name, loss in losses.items()}
 
 
 def fit_variance(
-    rows: Rows, choice: BaseChoice, inputs: tuple[str, ...], means: Sequence[Array] | None = None
+    rows: Rows,
+    choice: BaseChoice,
+    inputs: tuple[str, ...],
+    means: Sequence[Array] | None = None,
+    *,
+    between: bool = False,
 ) -> VarianceModel:
     """The variance on ``inputs``, and out of fold: no row is predicted by a fit that saw its group.
 
-    ``means``: see :class:`VarianceModel`, if the base has been fitted before.
+    ``means``: see :class:`VarianceModel`, if the base has been fitted before. ``between``: the inputs also explain how
+    sequences differ; else each has a level of its own.
     """
+    level = np.zeros_like(rows.group) if between else rows.group
     C = rows.select(base_columns(choice.method, choice.residual))
     terms = parts(np.where(np.isfinite(C), C, np.nanmedian(C, axis=0)), rows.dt_s)
     U = _gp_inputs(rows, inputs)
     fold = group_folds(rows.group, MOST_FOLDS)
     kept = [np.ones(len(terms), dtype=bool), *(fold != f for f in np.unique(fold))]
     means = means or [fit_coefficients(terms[of], rows.error[of], rows.weight[of]) for of in kept]
-    (theta, gp, left), *others = (_fit(rows, terms, U, of, mean) for of, mean in zip(kept, means, strict=True))
+    (theta, gp, left), *others = (_fit(rows, terms, U, of, mean, level) for of, mean in zip(kept, means, strict=True))
     plain = fit_coefficients(terms * OF_MOTION, left, rows.weight)
     oof = np.empty_like(rows.error)
     for of, (theta_without, gp_without, _) in zip(kept[1:], others, strict=True):
@@ -127,7 +145,7 @@ def fit_variance(
 
 
 def _fit(
-    rows: Rows, terms: Array, U: Array, of: NDArray[np.bool_], theta: Array
+    rows: Rows, terms: Array, U: Array, of: NDArray[np.bool_], theta: Array, level: NDArray[np.int64]
 ) -> tuple[Array, ProjectedGP | None, Array]:
     """Coefficients of the base, GP, and what it leaves of the errors, for the rows ``of``. The base, ``theta`` if
     alone, is the GP's mean function, fitted once more with it, in turn (C. E. Rasmussen, C. K. I. Williams, "Gaussian
@@ -135,7 +153,7 @@ def _fit(
     terms, error, weight = terms[of], rows.error[of], rows.weight[of]
     if U.shape[1] == 0:
         return theta, None, error
-    gp = fit_log_variance(U[of], error**2 / (terms * theta).sum(axis=-1), weight, rows.group[of])
+    gp = fit_log_variance(U[of], error**2 / (terms * theta).sum(axis=-1), weight, level[of])
     left = error * np.exp(-0.5 * log_ratio(gp, U[of]))
     return fit_coefficients(terms, left, weight), gp, left
 

@@ -5,7 +5,8 @@ The squared error over the base is a Student-t's; the log of its scale is a GP, 
 
 The kernel is a prior and is not learned: the marginal likelihood of few sequences, whose rows are alike, mistakes
 differences between sequences for structure and ends at length scales of a tenth of the data's width. A separate level
-for each sequence (a random effect) is removed for the same reason: the GP learns only from changes within sequences.
+for each sequence (a random effect) is removed for the same reason: the GP learns only from changes within sequences,
+unless all rows are given as one group, because sequences left out gain by it (:func:`gpvo.learning.fit.choose_inputs`).
 """
 
 from __future__ import annotations

@@ -145,13 +145,13 @@ class Rows:
 Candidate = TypeVar("Candidate", bound=Hashable)
 
 
-def significant_gain(gain_by_group: ArrayLike) -> bool:
-    """Whether the mean of gains (G,), one per held-out group, is more than its standard error.
+def significant_gain(gain_by_group: ArrayLike, errors: float = 1.0) -> bool:
+    """Whether the mean of gains (G,), one per held-out group, is more than its standard error, or so many of them.
 
     L. Breiman et al., "Classification and Regression Trees" (1984), section 3.4.3. Never with fewer than two groups.
     """
     gain = np.asarray(gain_by_group, dtype=np.float64)
-    return len(gain) > 1 and bool(gain.mean() > gain.std(ddof=1) / np.sqrt(len(gain)))
+    return len(gain) > 1 and bool(gain.mean() > errors * gain.std(ddof=1) / np.sqrt(len(gain)))
 
 
 def simplest_sufficient(loss_by_group: Mapping[Candidate, Array]) -> Candidate:
