@@ -4,13 +4,15 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, replace
+from pathlib import Path
 from typing import Any
 
-from gpvo.cameras.rig import TOLERANCES, Tolerance
+from gpvo.cameras.rig import Tolerance
 from gpvo.errors import GpvoError
+from gpvo.files import read_toml
 from gpvo.sim import imu
 from gpvo.sim.events import CAUSES
-from gpvo.types import StereoCamera
+from gpvo.types import StereoCamera, field_names
 
 
 @dataclass(frozen=True)
@@ -55,34 +57,18 @@ class PointsScenario:
         return max(1, round(self.imu_rate_hz / self.rate_hz))
 
 
-SCENARIOS: dict[str, PointsScenario] = {
-    "tunnel-clean": PointsScenario(),
-    "tunnel-noise": PointsScenario(sigma_px=0.6, outliers=0.08, tracks=120, drop=0.10),
-    "tunnel-bursts": PointsScenario(episodes_share=0.2),
-    "lunar-straight": PointsScenario(
-        world="lunar", path="straight", speed_mps=1.0, duration_s=210.0, rate_hz=10.0, noise_every=5, noise_px=0.5
-    ),
-    "room-t265": PointsScenario(
-        world="room",
-        path="wander",
-        speed_mps=0.8,
-        camera=StereoCamera(300.0, 300.0, 319.5, 239.5, 0.064, 640, 480),
-        imu="t265",
-        sigma_px=0.25,
-        tolerance=TOLERANCES["t265"],
-    ),
-    "street": PointsScenario(
-        world="street",
-        speed_mps=22.0,
-        rate_hz=10.0,
-        camera=StereoCamera(718.0, 718.0, 619.5, 187.5, 0.5, 1240, 376),
-        tracks=400,
-        reach_m=80.0,
-    ),
-}
-SCENARIOS["street-traffic"] = replace(SCENARIOS["street"], cars=6, texture=0.5)
-SCENARIOS["tunnel-smoke"] = PointsScenario(smoke=0.3)
-SCENARIOS["lunar-dust"] = replace(SCENARIOS["lunar-straight"], duration_s=60.0, dust=0.3)
+def _landmarks_alone(table: Mapping[str, Any]) -> PointsScenario:
+    """The flight without images of a scenario's file: its table ``landmarks`` holds what flights with images lack."""
+    values = {**table, **table["landmarks"]}
+    values["tolerance"] = replace(Tolerance(**table.get("calibration", {})), distortion=0.0)  # of a rectified pair
+    if "camera" in values:
+        values["camera"] = StereoCamera(**values["camera"])
+    return PointsScenario(**{name: values[name] for name in field_names(PointsScenario) if name in values})
+
+
+FOLDER = Path(__file__).parent / "scenarios"
+_FILES = {file.stem: read_toml(file) for file in sorted(FOLDER.glob("*.toml"))}
+SCENARIOS = {name: _landmarks_alone(table) for name, table in _FILES.items() if "landmarks" in table}
 
 
 def _within(least: float, most: float, kind: type = float) -> Callable[[Any], bool]:

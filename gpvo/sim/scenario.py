@@ -18,7 +18,7 @@ from gpvo.files import read_toml
 from gpvo.geometry.se3 import path_length_m
 from gpvo.parallel import map_jobs
 from gpvo.sim.points import simulate_points
-from gpvo.sim.points_scenario import SCENARIOS, PointsScenario, check_values
+from gpvo.sim.points_scenario import FOLDER, SCENARIOS, PointsScenario, check_values
 from gpvo.sim.rig import CAMERAS, camera_rig
 
 CalibrationKey = Literal["baseline", "focal", "rotation_rad", "distortion"]
@@ -36,7 +36,6 @@ _IMAGES_ALONE = {
     "camera_pitch_deg": "", "right_light": "", "exposure_s": "", "sway_m": "", "agility": "", "depth": "", "flow": "",
 }  # fmt: skip
 """What only flights with images take, and what is like it without."""
-_FOLDER = Path(__file__).parent / "scenarios"
 
 
 class Scenario(BaseModel):
@@ -124,7 +123,7 @@ class Flight:
 
 def names() -> tuple[str, ...]:
     """Names of the scenarios that come with the package."""
-    return tuple(sorted(file.stem for file in _FOLDER.glob("*.toml")))
+    return tuple(sorted(file.stem for file in FOLDER.glob("*.toml")))
 
 
 def load_scenario(name: str, overrides: Mapping[str, Any] | None = None) -> Scenario:
@@ -134,11 +133,13 @@ def load_scenario(name: str, overrides: Mapping[str, Any] | None = None) -> Scen
     """
     if not name.endswith(".toml") and name not in names():
         raise GpvoError(f"unknown scenario '{name}'", cure=_nearest(name, names()))
-    file = Path(name) if name.endswith(".toml") else _FOLDER / f"{name}.toml"
+    file = Path(name) if name.endswith(".toml") else FOLDER / f"{name}.toml"
     table = read_toml(file)
     # A resolved scenario, as it lies beside a sequence, may be flown again.
     for beside in ("seed", "files", "drawn"):
         table.pop(beside, None)
+    if file.parent == FOLDER:
+        table.pop("landmarks", None)  # SCENARIOS holds them
     table.setdefault("name", file.stem)
     for key, value in (overrides or {}).items():
         _put(table, key, value)
