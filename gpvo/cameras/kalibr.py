@@ -21,6 +21,13 @@ from gpvo.geometry import se3
 from gpvo.types import Array, ImuNoise
 
 _PAIR = ("cam0", "cam1")
+NOISE_KEYS = {
+    "gyroscope_noise_density": "gyro_density_radps_sqrthz",
+    "gyroscope_random_walk": "gyro_walk_radps2_sqrthz",
+    "accelerometer_noise_density": "acc_density_mps2_sqrthz",
+    "accelerometer_random_walk": "acc_walk_mps3_sqrthz",
+}
+"""What Kalibr and EuRoC call the fields of :class:`gpvo.types.ImuNoise`."""
 _MAX_BYTES = 100_000  # a calibration has a few thousand
 # Chained and direct transforms of one calibration agree to the digits printed; a mistaken meaning does not.
 _CHAIN_TOLERANCE_M, _CHAIN_TOLERANCE = 5e-3, 0.1  # the latter of the baseline: that of an endoscope is 4 mm
@@ -143,12 +150,7 @@ def read_imu_noise(path: Path) -> ImuNoise:
             raise CalibrationError(f"'{key}' is negative", where=path)
         return value
 
-    return ImuNoise(
-        gyro_density_radps_sqrthz=number("gyroscope_noise_density"),
-        acc_density_mps2_sqrthz=number("accelerometer_noise_density"),
-        gyro_walk_radps2_sqrthz=number("gyroscope_random_walk"),
-        acc_walk_mps3_sqrthz=number("accelerometer_random_walk"),
-    )
+    return ImuNoise(**{field: number(key) for key, field in NOISE_KEYS.items()})
 
 
 def make_lens(

@@ -23,6 +23,7 @@ import numpy as np
 import yaml
 from numpy.typing import NDArray
 
+from gpvo.cameras.kalibr import NOISE_KEYS
 from gpvo.cameras.models import CameraModel
 from gpvo.cameras.rig import StereoRig
 from gpvo.errors import GpvoError, OutputError
@@ -249,14 +250,7 @@ def _write_calibration(folder: Path, rig: StereoRig, rate_hz: float, offset_s: f
 
 def _write_imu(folder: Path, log: ImuLog, rate_hz: float, gravity_mps2: float) -> None:
     """``imu0`` and ``dso/imu_config.yaml``."""
-    noise = log.noise
-    assert noise is not None
-    densities = {
-        "gyroscope_noise_density": noise.gyro_density_radps_sqrthz,
-        "gyroscope_random_walk": noise.gyro_walk_radps2_sqrthz,
-        "accelerometer_noise_density": noise.acc_density_mps2_sqrthz,
-        "accelerometer_random_walk": noise.acc_walk_mps3_sqrthz,
-    }
+    densities = {key: getattr(log.noise, field) for key, field in NOISE_KEYS.items()}
     _sensor(folder / "mav0" / "imu0", "imu", np.eye(4), rate_hz=rate_hz, **densities, gravity_mps2=gravity_mps2)
     _yaml(folder / "dso" / "imu_config.yaml", {**densities, "update_rate": rate_hz, "rostopic": "/imu0"})
     rows = np.concatenate([log.gyro_radps, log.acc_mps2], axis=1)
