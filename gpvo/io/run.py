@@ -27,8 +27,8 @@ from gpvo.files import digest_of_file, write_json, write_toml
 from gpvo.geometry.covariance import are_covariances, from_upper, upper
 from gpvo.io import run_folder, run_table
 from gpvo.io.parquet import RowGroup, join_tables, write_table
-from gpvo.io.run_folder import SCHEMA, is_finished
-from gpvo.io.run_read import Run, read_predictions, read_run, read_tracks, table_of
+from gpvo.io.run_folder import is_finished
+from gpvo.io.run_read import SCHEMA, Run, read_predictions, read_run, read_tracks, table_of
 from gpvo.io.snapshot import save_snapshot
 from gpvo.io.trajectory import tum_line
 from gpvo.types import Array, ImuLog, Mounting, Prediction, StereoCamera, StereoTracks, TruthLog, VoLog, VoRecord

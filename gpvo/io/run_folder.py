@@ -16,11 +16,10 @@ from gpvo.errors import OutputError, SourceError
 from gpvo.files import FolderLock, make_folder, read_json
 from gpvo.io import run_table
 from gpvo.io.parquet import RowGroup, placed_columns, read_columns, write_table
-from gpvo.io.run_read import check_log
+from gpvo.io.run_read import SCHEMA, check_log
 from gpvo.io.snapshot import load_snapshot
 from gpvo.types import ImuLog, StoredRecords, TruthLog, VoLog
 
-SCHEMA = 1
 FILES = (
     "vo_log.parquet", "trajectory.tum", "rig.json", "truth.parquet", "imu.parquet", "predictions.parquet",
     "tracks.parquet",

@@ -37,7 +37,7 @@ from gpvo.types import (
 
 T = TypeVar("T")
 
-_MAX_SCHEMA = 1
+SCHEMA = 1
 _MAKE = "make one with 'gpvo run' of images, or 'gpvo import' of poses"
 _LARGEST = 1e12  # No mean or variance that a model states is larger [m, rad, m^2, rad^2].
 
@@ -114,8 +114,8 @@ def read_meta(path: Path) -> dict[str, Any]:
     file = path / "run.json"
     meta = read_json(file, as_is=_PATHS)
     schema = meta.get("schema")
-    if not isinstance(schema, int) or schema > _MAX_SCHEMA:
-        raise SourceError(f"has schema {schema!r}, this gpvo reads {_MAX_SCHEMA}", where=file, cure="upgrade")
+    if not isinstance(schema, int) or schema > SCHEMA:
+        raise SourceError(f"has schema {schema!r}, this gpvo reads {SCHEMA}", where=file, cure="upgrade")
     for holder, kinds in ((meta, _META), (meta.get("twin") or None, _TWIN)):
         wrong = [key for key, holds in kinds.items() if isinstance(holder, dict) and not holds(holder.get(key))]
         if wrong:

@@ -11,7 +11,8 @@ from gpvo.accumulation import PoseError, between_ends, carry
 from gpvo.errors import GpvoError
 from gpvo.geometry import se3
 from gpvo.geometry.covariance import is_positive_definite, lost_covariance, symmetrise
-from gpvo.geometry.se3 import R_FLU_OPTICAL, rotate_covariance
+from gpvo.geometry.se3 import rotate_covariance
+from gpvo.io.foreign import T_FLU_OPTICAL
 from gpvo.types import IMPORTED_POSE, Array, MotionError, Prediction, Status, VoRecord
 
 
@@ -91,8 +92,7 @@ class OdometryBuilder:
     resets: int = 0
 
     def __post_init__(self) -> None:
-        forward = se3.from_rt(R_FLU_OPTICAL, np.zeros(3))
-        self.place(forward if self.T_body_cam is None else np.asarray(self.T_body_cam, dtype=np.float64))
+        self.place(T_FLU_OPTICAL if self.T_body_cam is None else np.asarray(self.T_body_cam, dtype=np.float64))
         self._T_odom_cam = self.T_odom_body @ self._T_body_cam
         self._chain: dict[int, _Chain] = {}
         self._last: tuple[_Chain, MotionError] | None = None  # the last good frame and what was stated of its motion

@@ -26,12 +26,11 @@ from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 from gpvo.errors import GpvoError
 from gpvo.files import make_folder
 from gpvo.geometry import se3
-from gpvo.io.bag_reader import open_bag
+from gpvo.io.bag_reader import ODOMETRY_TYPE, open_bag
 from gpvo.publish.mavlink import flu, frd, quality
 from gpvo.publish.odometry import Odometry
 
 TOPIC = "/gpvo/odometry"
-_TYPE = "nav_msgs/msg/Odometry"
 PX4_TOPIC = "/fmu/in/vehicle_visual_odometry"
 PX4_TYPE = "px4_msgs/msg/VehicleOdometry"
 _POSE_FRAME_FRD, _VELOCITY_FRAME_BODY_FRD = 2, 3
@@ -64,7 +63,7 @@ def odometry_message(odometry: Odometry, types: dict[str, Any], *, seq: int | No
     twist = types["geometry_msgs/msg/Twist"](vector(*linear), vector(*angular))
     stamp = types["builtin_interfaces/msg/Time"](odometry.t_ns // 10**9, odometry.t_ns % 10**9)
     numbered = {} if seq is None else {"seq": seq}
-    return types[_TYPE](
+    return types[ODOMETRY_TYPE](
         header=types["std_msgs/msg/Header"](**numbered, stamp=stamp, frame_id=odometry.frame_id),
         child_frame_id=odometry.child_frame_id,
         pose=types["geometry_msgs/msg/PoseWithCovariance"](pose, _flat(odometry.pose_covariance)),
@@ -137,7 +136,7 @@ def _fill(path: Path, messages: Iterable[tuple[int, bytes]], topic: str, kind: s
     ros1, count, shift_ns, last_ns = kind == "ros1", 0, 0, -1
     opened: Any = Ros1Writer(path) if ros1 else Ros2Writer(path, version=9, storage_plugin=StoragePlugin[kind.upper()])
     with opened as writer:
-        connection = writer.add_connection(topic, _TYPE, typestore=_store(kind))
+        connection = writer.add_connection(topic, ODOMETRY_TYPE, typestore=_store(kind))
         for t_ns, data in messages:
             # Readers sort by the time of recording: where the stamps are set back, that goes on.
             shift_ns = max(shift_ns, last_ns + 1 - t_ns)
@@ -155,7 +154,7 @@ def _serialised(odometry: Iterable[Odometry], kind: str, seq: int) -> Iterator[t
     store, ros1 = _store(kind), kind == "ros1"
     serialise = store.serialize_ros1 if ros1 else store.serialize_cdr
     for number, item in enumerate((o for o in odometry if o.twist_body is not None), seq):
-        yield item.t_ns, serialise(odometry_message(item, store.types, seq=number if ros1 else None), _TYPE)
+        yield item.t_ns, serialise(odometry_message(item, store.types, seq=number if ros1 else None), ODOMETRY_TYPE)
 
 
 def _raw(bags: Iterable[Path]) -> Iterator[tuple[int, bytes]]:

@@ -11,7 +11,6 @@ from scipy.ndimage import gaussian_filter1d
 
 from gpvo.errors import SourceError
 from gpvo.geometry import se3
-from gpvo.geometry.se3 import R_FLU_OPTICAL
 from gpvo.sim.paths import RAMP_S, Path3, knots, rotations, smooth_start
 from gpvo.types import Array
 
@@ -83,13 +82,13 @@ def read_recording(file: Path, duration_s: float, rest_s: float = 3.0) -> Record
 
 def _read(path: Path) -> tuple[Array, Array]:
     """Times (N,) [s] from 0 and poses (N, 4, 4) of a body (forward, left, up) in a world whose z points up."""
+    from gpvo.io.foreign import T_FLU_OPTICAL
     from gpvo.io.run_read import is_run, read_run
     from gpvo.io.trajectory import read_euroc_csv, read_tum
 
     if is_run(path):
         log = read_run(path).log
-        turn = se3.from_rt(R_FLU_OPTICAL, np.zeros(3))
-        return (log.t_ns - log.t_ns[0]) * 1e-9, turn @ log.trajectory() @ turn.T
+        return (log.t_ns - log.t_ns[0]) * 1e-9, T_FLU_OPTICAL @ log.trajectory() @ T_FLU_OPTICAL.T
     recorded = read_euroc_csv(path) if path.suffix.lower() == ".csv" else read_tum(path)
     return (recorded.t_ns - recorded.t_ns[0]) * 1e-9, recorded.T_world_body
 
