@@ -189,19 +189,19 @@ def groups() -> dict[str, tuple[FeatureGroup, ...]]:
 
 
 def resolve(selection: str | Sequence[str]) -> tuple[str, ...]:
-    """Column names of a selection: ``thesis``, ``full``, or names of groups and columns, as a list or comma-separated.
+    """Column names of a selection: ``thesis``, ``full``, names of groups and columns, as a list or comma-separated.
 
     ``full`` is every group but ``imu_axes`` and ``residual``. Raises GpvoError for an unknown name.
     """
-    if selection == "thesis":
-        return THESIS
-    wanted = [w for w in groups() if w not in ("imu_axes", "residual")] if selection == "full" else selection
-    if isinstance(wanted, str):
-        wanted = [w.strip() for w in wanted.split(",") if w.strip()]
+    if isinstance(selection, str):
+        selection = [w.strip() for w in selection.split(",") if w.strip()]
     out: dict[str, None] = {}
-    for name in wanted:
-        if name in groups():
-            out.update(dict.fromkeys(c.name for group in groups()[name] for c in group.columns))
+    for name in selection:
+        if name == "thesis":
+            out.update(dict.fromkeys(THESIS))
+        elif name in ("full", *groups()):
+            parts = [g for g in groups() if g not in ("imu_axes", "residual")] if name == "full" else [name]
+            out.update(dict.fromkeys(c.name for part in parts for group in groups()[part] for c in group.columns))
         elif name in known_columns():
             out[name] = None
         else:

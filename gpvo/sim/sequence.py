@@ -237,10 +237,11 @@ def _write_calibration(folder: Path, rig: StereoRig, rate_hz: float, offset_s: f
     T_body_right = rig.T_body_left @ se3.inverse(rig.T_right_left)
     chain: dict[str, Any] = {}
     for i, (lens, T) in enumerate(((rig.left, rig.T_body_left), (rig.right, T_body_right))):
-        _sensor(folder / "mav0" / f"cam{i}", "camera", T, rate_hz=rate_hz, **_lens(lens, "distortion_coefficients"))
+        values = _lens(lens, "coefficients", "radial-tangential")
+        _sensor(folder / "mav0" / f"cam{i}", "camera", T, rate_hz=rate_hz, **values)
         chain[f"cam{i}"] = {
             "T_cam_imu": se3.inverse(T).tolist(),
-            **_lens(lens, "distortion_coeffs"),
+            **_lens(lens, "coeffs", "radtan"),
             "rostopic": f"/cam{i}/image_raw",
             "timeshift_cam_imu": offset_s,
         }
@@ -266,13 +267,14 @@ def _write_truth(folder: Path, t_ns: NDArray[np.int64], motion: Motion, bias_gyr
     _csv(base / "data.csv", _TRUTH_HEAD, t_ns, rows)
 
 
-def _lens(lens: CameraModel, distortion_key: str) -> dict[str, Any]:
+def _lens(lens: CameraModel, coefficients: str, radtan: str) -> dict[str, Any]:
+    """In the words of EuRoC or of Kalibr."""
     fisheye = lens.kind == "kannala-brandt"
     return {
         "camera_model": "pinhole",
         "intrinsics": lens.intrinsics_px,
-        "distortion_model": "equidistant" if fisheye else "radial-tangential",
-        distortion_key: [float(k) for k in lens.distortion[: 5 if any(lens.distortion[4:]) else 4]],
+        "distortion_model": "equidistant" if fisheye else radtan,
+        f"distortion_{coefficients}": [float(k) for k in lens.distortion[: 5 if any(lens.distortion[4:]) else 4]],
         "resolution": [lens.width, lens.height],
     }
 
