@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import warnings
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -15,6 +16,7 @@ from gpvo.sim.paths import RAMP_S, Path3, knots, rotations, smooth_start
 from gpvo.types import Array
 
 _STEP_S = 0.02
+_UNNOTICED = 0.9
 
 
 @dataclass(frozen=True)
@@ -40,7 +42,9 @@ class Recording:
         self, middle: Array, yaw_rad: float, scale: float, heading_rad: float, duration_s: float, rest_s: float = 3.0
     ) -> Path3:
         """The recording as a path: turned by ``yaw_rad``, scaled, its extent about ``middle`` (3,), the body level at
-        the start with the nose at ``heading_rad``."""
+        the start with the nose at ``heading_rad``. Warns where it is made smaller: the speeds are, too."""
+        if scale < _UNNOTICED:
+            warnings.warn(f"the path is flown at {scale:.2g} of its size and speed, to fit the world", stacklevel=2)
         turn = _about_z(yaw_rad)
         grid = np.arange(len(self.position_m)) * _STEP_S
         place = make_interp_spline(grid, self.turned_by(yaw_rad) * scale + middle, k=5)

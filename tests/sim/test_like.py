@@ -53,6 +53,16 @@ def test_the_flight_is_flown_again(flown: tuple[Path, float]) -> None:
     assert len(again.frame) > 50 * len(again.t_s)
 
 
+def test_a_path_made_smaller_is_told(flown: tuple[Path, float], recwarn: pytest.WarningsRecorder) -> None:
+    """In a hall of 12 m a drive of 150 m was flown at a walk, without a word."""
+    path, _ = flown
+    with pytest.warns(UserWarning, match=r"flown at 0.11 of its size and speed"):
+        simulate_points(points_scenario(load_scenario("room-t265", like(path))), 1)
+    recwarn.clear()
+    simulate_points(points_scenario(load_scenario("street", like(path))), 1)
+    assert not recwarn
+
+
 def test_a_run_without_tracks_is_refused(flown: tuple[Path, float], tmp_path: Path) -> None:
     path, _ = flown
     bare = tmp_path / "bare"
