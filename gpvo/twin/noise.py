@@ -22,7 +22,7 @@ from scipy import sparse
 from scipy.spatial import cKDTree
 
 from gpvo.geometry import se3
-from gpvo.twin.bundle import WHITEN, Chart, Estimate, NormalEquations, Observations, Pieces
+from gpvo.twin.bundle import WHITEN, Chart, Estimate, NormalEquations, Observations, Pieces, projection_jacobian, summed
 from gpvo.types import Array
 from gpvo.vo.motion import CHI2_3_999, CHI2_3_MEDIAN, huber
 
@@ -111,6 +111,45 @@ def without_loose_frames(structure: Structure, seen: Observations, t_ns: NDArray
             a, b = known[j - 1], known[j]
             T[k] = se3.interpolate(T[a], T[b], np.asarray((t_ns[k] - t_ns[a]) / (t_ns[b] - t_ns[a])))
     return replace(structure, T_world_cam=T)
+
+
+_LEAST_LEFT = 0.25  # of the variance of a residual that the pose took most of
+
+
+def restored(seen: Observations, structure: Structure) -> Array:
+    """Residuals (M, 3) [px] as large as the noise behind them.
+
+    What two frames say of their motion does not depend on where the landmarks are, so residuals keep it whole (of a
+    point seen twice they hold the difference of both measurements, exactly). What the pose took is given back: the
+    most where a few near points decide it, as there the fit follows the noise (leverage; "HC2" of J. MacKinnon,
+    H. White, 1985). Spread evenly over a frame, it would leave the errors of twins too small.
+    """
+    used = structure.weight > 0
+    length = np.bincount(seen.track, used, minlength=len(structure.points_world))[seen.track]
+    root = np.sqrt(structure.weight * (1.0 - 1.0 / np.maximum(length, 1.0))) / structure.sigma_px[seen.frame]
+    information = np.zeros((len(structure.T_world_cam), 6, 6))
+    for rows, part in seen.parts():
+        A = _pose_slopes(part, structure, root[rows])
+        information += summed(np.swapaxes(A, 1, 2) @ A, part.frame, len(information))
+    scale = 1.0 / np.sqrt(np.maximum(np.diagonal(information, axis1=1, axis2=2), 1e-12))
+    outer = scale[:, :, None] * scale[:, None, :]
+    covariance = outer * np.linalg.inv(outer * information + 1e-9 * np.eye(6))
+    noise = np.empty_like(structure.residual_px)
+    for rows, part in seen.parts():
+        A = _pose_slopes(part, structure, root[rows])
+        taken, axes = np.linalg.eigh(A @ covariance[part.frame] @ np.swapaxes(A, 1, 2))
+        z = np.einsum("mij,mi->mj", axes, structure.residual_px[rows] @ WHITEN.T)
+        z /= np.sqrt(np.maximum(1.0 - taken, _LEAST_LEFT))
+        noise[rows] = np.einsum("mij,mj->mi", axes, z) @ np.linalg.inv(WHITEN).T
+    return np.where(used[:, None], noise, structure.residual_px)
+
+
+def _pose_slopes(seen: Observations, structure: Structure, root_weight: Array) -> Array:
+    """(M, 3, 6) derivatives of whitened (u, v, d), times ``root_weight`` (M,), by the pose of the frame."""
+    P = structure.in_camera(seen)
+    by_pose = np.concatenate([-np.broadcast_to(np.eye(3), (len(P), 3, 3)), se3.skew(P)], axis=2)
+    slopes: Array = root_weight[:, None, None] * (WHITEN @ projection_jacobian(P, seen.camera) @ by_pose)
+    return slopes
 
 
 _EDGES_PX = (0.0, 10.0, 20.0, 40.0)

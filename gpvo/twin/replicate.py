@@ -24,7 +24,7 @@ from gpvo.runner import run as run_odometry
 from gpvo.twin.bundle import Observations
 from gpvo.twin.common import CommonField, drawn_signs
 from gpvo.twin.gap import Gap, restated
-from gpvo.twin.noise import Neighbours, Structure, adjust, draw_signs, without_loose_frames
+from gpvo.twin.noise import Neighbours, Structure, adjust, draw_signs, restored, without_loose_frames
 from gpvo.types import Array, ImuLog, Mounting, StereoCamera, TrackFrame, TruthLog, VoRecord
 from gpvo.vo.config import VoConfig
 from gpvo.vo.rig_error import N_TERMS, RigError, RigState, terms
@@ -80,7 +80,7 @@ def estimate(path: Path) -> Original:
     if not np.isfinite(structure.residual_px).all():
         raise SourceError("its structure cannot be estimated: the fit fails", where=path, cure="look at the run")
     neighbours = Neighbours.of(seen, structure)
-    noise = _noise(seen, structure)
+    noise = restored(seen, structure)
     common = CommonField.of(seen, structure, noise, drawn_signs(len(structure.points_world), neighbours), t_ns)
     start = read_start(path, camera)
     return Original(run, config_of(path), rig, seen, structure, noise, neighbours, common, first, repeats, start)
@@ -101,21 +101,6 @@ def _refuse_too_few(frame: NDArray[np.int64], path: Path) -> None:
             where=path,
             cure="run it with more features, or train on runs with ground truth",
         )
-
-
-def _noise(seen: Observations, structure: Structure) -> Array:
-    """Residuals (M, 3) as large as the noise behind them.
-
-    What two frames say of their motion does not depend on where the landmarks are, so residuals keep it whole (of a
-    point seen twice they hold the difference of both measurements, exactly). What the pose took of a frame's ``n``
-    degrees of freedom beside the landmarks, 6, is given back.
-    """
-    used = structure.weight > 0
-    length = np.bincount(seen.track, used, minlength=len(structure.points_world))
-    share = np.where(used, 1.0 - 1.0 / np.maximum(length[seen.track], 1.0), 0.0)
-    dof = 3.0 * np.bincount(seen.frame, share, minlength=len(structure.T_world_cam))
-    factor = np.sqrt(dof / np.maximum(dof - 6.0, 0.25 * np.maximum(dof, 1.0)))
-    return structure.residual_px * np.where(used, factor[seen.frame], 1.0)[:, None]
 
 
 @dataclass(frozen=True)

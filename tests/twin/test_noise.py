@@ -4,9 +4,10 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+from gpvo.geometry import se3
 from gpvo.twin import noise
-from gpvo.twin.bundle import Observations
-from gpvo.twin.noise import Neighbours, Structure, _sums_of, draw_signs
+from gpvo.twin.bundle import WHITEN, Observations, projection_jacobian
+from gpvo.twin.noise import Neighbours, Structure, _sums_of, draw_signs, restored
 from gpvo.types import StereoCamera
 
 CAMERA = StereoCamera(400.0, 400.0, 319.5, 239.5, 0.1, 640, 480)
@@ -88,3 +89,32 @@ def test_a_mean_of_noise_scatters_as_much_as_the_noise_does():
     real_rms, found_rms, alone_rms = (np.sqrt(np.mean(np.square(x))) for x in (real, found, alone))
     assert found_rms > 0.8 * real_rms
     assert alone_rms < 0.75 * real_rms
+
+
+def test_what_a_pose_took_is_given_back_where_it_took_it():
+    """Five near points decide how far the camera went: given back evenly, 0.64 of its squared error is left."""
+    rng = np.random.default_rng(4)
+    frames, points = 200, 30
+    depth = np.where(np.arange(points) < 5, 1.5, 20.0)
+    P = np.c_[rng.uniform([-0.7, -0.5], [0.7, 0.5], (points, 2)) * depth[:, None], depth]
+    by_pose = np.concatenate([-np.broadcast_to(np.eye(3), (points, 3, 3)), se3.skew(P)], axis=2)
+    A = (WHITEN @ projection_jacobian(P, CAMERA) @ by_pose).reshape(-1, 6)
+    solve = np.linalg.pinv(A)
+    true = 0.2 * rng.standard_normal((frames, 3 * points))
+    left = true - true @ solve.T @ A.T
+
+    def pixels(z):
+        return z.reshape(-1, 3) @ np.linalg.inv(WHITEN).T
+
+    def energy(noise):
+        by_point = solve.reshape(6, points, 3) * (noise @ WHITEN.T).reshape(frames, 1, points, 3)
+        return (by_point.sum(axis=3) ** 2).sum(axis=(0, 2))
+
+    frame, track = (i.ravel() for i in np.meshgrid(np.arange(frames), np.arange(points), indexing="ij"))
+    used = np.ones(len(frame))
+    seen = Observations(CAMERA, frame, track, np.tile(CAMERA.project(P), (frames, 1)), used > 0)
+    T = np.tile(np.eye(4), (frames, 1, 1))
+    found = restored(seen, Structure(T, P, pixels(left), used, np.full(frames, 0.2), True))
+    assert energy(found) / energy(pixels(true)) == pytest.approx(1.0, abs=0.1)
+    evenly = pixels(left) * np.sqrt(points / (points - 2))
+    assert (energy(evenly) / energy(pixels(true)))[2] < 0.75
