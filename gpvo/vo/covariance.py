@@ -51,7 +51,9 @@ _USUAL_RATIO = 10.0  # prior deviation: an error of disparity three times the no
 
 _BLOCK = 20  # motions, longer than most features live
 _EXCESS = 16.0, 2.0  # of scatter to begin with, and the number of blocks that this guess is worth
-_DILUTION = 0.1  # share of it, standard deviation: noise differs by direction, so what persists is known no better
+# Shares, as standard deviations, by which the noise may be another than stated: what persists, as noise differs by
+# direction, and the variances of the column and of the row, which edges one way alone make any.
+_DILUTION = np.array([0.1, 1.0, 1.0])
 
 
 @dataclass(frozen=True)
@@ -321,8 +323,8 @@ class NoiseEstimator:
 
 @dataclass(frozen=True)
 class Sums:
-    """Information (n, n) and score (n,) of errors of the rig as if frames were independent, and the dilution (n,) of
-    the score."""
+    """Information (n, n) and score (n,) of errors of the rig as if frames were independent, and the dilutions (n, 3) of
+    the score by what persists and by the variances of column and row, were all of each not there."""
 
     information: Array
     score: Array
@@ -338,7 +340,8 @@ class Blocks:
     """The sums of all motions, and by how much blocks of frames scatter more than if frames were independent."""
 
     def __init__(self, precision: Array) -> None:
-        self.sums = self._before = Sums(0.0 * precision, 0.0 * precision[0], 0.0 * precision[0])
+        none = np.zeros((len(precision), len(_DILUTION)))
+        self.sums = self._before = Sums(0.0 * precision, 0.0 * precision[0], none)
         self._count = 0
         freedom = _EXCESS[1] * len(precision)
         self._scatter = self._scatter_earlier = (_EXCESS[0] * freedom, freedom)
@@ -358,10 +361,10 @@ class Blocks:
             return sums.information / excess, sums.score / excess
         dilution = _DILUTION * sums.dilution
         diluted = np.linalg.solve(sums.information + self._floor, dilution)
-        part = dilution / (excess + dilution @ diluted)
+        part = dilution @ np.linalg.inv(excess * np.eye(len(_DILUTION)) + dilution.T @ diluted)
         return (
-            (sums.information - np.outer(part, dilution)) / excess,
-            (sums.score - part * (diluted @ sums.score)) / excess,
+            (sums.information - part @ dilution.T) / excess,
+            (sums.score - part @ (diluted.T @ sums.score)) / excess,
         )
 
     def add(self, information: Array, score: Array, dilution: Array | float = 0.0) -> None:

@@ -122,6 +122,21 @@ class RigState:
         return cls(np.zeros(N_COEFFICIENTS), np.zeros((N_COEFFICIENTS, N_COEFFICIENTS)), 0.0)
 
 
+def _mistaken(motion: Motion, white: Whitened) -> list[Array]:
+    """(3, N) each: covariance of a point's smoothed disparity and its residual where a part of the noise is not there,
+    though stated: what persists, then the variances of column and row. It would be zero if the noise were as stated."""
+    G, S, persistent = white.moved.G, motion.noise.S, motion.noise.persistent
+    g = persistent_direction(G)
+    gain = np.einsum("k,ikn->in", S[2], G) - persistent * g
+    gain = np.einsum("jin,jn->in", white.W, apply_whitener(white.W, gain))
+    out = [persistent * g]
+    for k in range(2):
+        q = G[:, k] * (gain * G[:, k]).sum(0)
+        q[k] += gain[k]
+        out.append(S[k, k] * q)
+    return out
+
+
 class RigError:
     """The running estimate, and what it does to measurements.
 
@@ -238,19 +253,19 @@ class RigError:
             near = motion.uvd_prev[:, 2] > min_disparity_px + _NEAR * sigma_px
             if sharp and near.sum() >= 8:
                 # The derivatives by the translation are in proportion to the disparity, and so to its error.
-                g = apply_whitener(white.W, persistent_direction(moved.G)) * (root / scale_px)
-                along = (by_motion[:, :3] * g[:, None]).sum(0)
-                dilution = along * motion.noise.persistent * motion.scale_px**2 / motion.uvd_prev[:, 2]
+                by_d = motion.scale_px**2 / motion.uvd_prev[:, 2] * (root / scale_px)
+                mistaken = (apply_whitener(white.W, q) * by_d for q in _mistaken(motion, white))
+                dilution = np.stack([(by_motion[:, :3] * q[:, None])[..., near].sum((0, 2)) for q in mistaken], axis=1)
                 of_near = np.tile(near, 3)
-                self._learn_disparities(A[of_near], B[of_near], dilution[:, near].sum(axis=1))
+                self._learn_disparities(A[of_near], B[of_near], dilution)
             by_dy, of = (phi, row_error) if displaced is None else (self._terms(displaced[0], twists[1]), displaced[1])
             self._learn_rows(by_dy[1], of)
             self._conclude()
         return added
 
     def _learn_disparities(self, A: Array, B: Array, dilution: Array) -> None:
-        """``A`` (n, 6), ``B`` (n, 17): whitened derivatives by the motion, by dx, and residuals; ``dilution`` (3,) of
-        the translation's score."""
+        """``A`` (n, 6), ``B`` (n, 17): whitened derivatives by the motion, by dx, and residuals; ``dilution`` (3, 3)
+        of the translation's score, each column for another part of the noise."""
         K = np.linalg.solve(A.T @ A, A.T @ B)
         rest = B - A @ K
         sums = rest.T @ rest
