@@ -211,6 +211,8 @@ class PairWatch:
         Then a point's right row is where the left one was: the error of rows is the motion of rows, with a minus.
         """
         error, motion = _centred(right.row_error_px), _centred(right.row_motion_px)
+        usual = _usual(error) & _usual(motion)  # a few false matches would outweigh all others
+        error, motion = error[usual], motion[usual]
         now = np.array([len(error), error @ error, error @ motion, motion @ motion])
         self._rows = _MEMORY * self._rows + now
         n, ee, em, mm = self._rows
@@ -235,6 +237,11 @@ def lateness_covariance(late: float, T_prev_cur: Array) -> Array:
 def _centred(x: Array) -> Array:
     """Without its median: a vertical offset of the cameras is no delay."""
     return np.asarray(x, np.float64) - np.median(x) if len(x) else np.zeros(0)
+
+
+def _usual(x: Array) -> NDArray[np.bool_]:
+    """Which of these deviations from a median are within four of their standard deviations."""
+    return np.abs(x) <= 4 * 1.4826 * np.median(np.abs(x)) if len(x) else np.zeros(0, bool)
 
 
 def motion_fields(matches: Matches, motion: Motion, camera: StereoCamera, moments: ResidualMoments) -> dict[str, Any]:

@@ -231,6 +231,16 @@ def test_rows_that_lag_behind_are_a_delay() -> None:
     assert watch.step(good, RightSearch(200, 200, 0, 0, rng.normal(0, 0.2, 200), motion)) == []
 
 
+def test_a_few_false_matches_do_not_hide_a_delay() -> None:
+    """One point in twenty was followed to a place far from its own."""
+    rng = np.random.default_rng(0)
+    motion = rng.normal(0, 2, 200)
+    error = -motion + rng.normal(0, 0.2, 200)
+    motion[::20], error[::20] = rng.normal(0, 40, 10), rng.normal(0, 5, 10)
+    doubts = PairWatch(pinhole(480, 360)).step(Observation(None, False), RightSearch(200, 200, 0, 0, error, motion))
+    assert doubts == ["the right image is 1.0 frames late"]
+
+
 def test_a_late_image_is_not_in_time_as_it_slows_down() -> None:
     """Rows that lag by less than a wrong rig displaces them: a delay where there was one, and else nothing."""
     rng = np.random.default_rng(0)
