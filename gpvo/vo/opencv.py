@@ -149,6 +149,10 @@ def pose_from_points(
         return None
     if not found or inliers is None or not np.isfinite(rvec).all() or not np.isfinite(tvec).all():
         return None
+    # What OpenCV fits to the inliers at last, EPnP, errs in metres: a few far points outweigh all near ones.
+    agreeing, pixels = points[inliers[:, 0]], uv[inliers[:, 0]]
+    found, *better = cv2.solvePnP(agreeing, pixels, K, None, flags=cv2.SOLVEPNP_SQPNP)
+    rvec, tvec = better if found and np.isfinite(better).all() else (rvec, tvec)
     T = np.eye(4)
     T[:3, :3] = cv2.Rodrigues(rvec)[0]
     T[:3, 3] = tvec.ravel()

@@ -4,6 +4,7 @@ from gpvo.geometry import se3
 from gpvo.types import StereoCamera
 from gpvo.vo.covariance import motion_covariance
 from gpvo.vo.motion import refine, residual_covariance, transfer, whitener
+from gpvo.vo.opencv import pose_from_points
 from gpvo.vo.points import PointNoise, triangulate, triangulation_pixel_covariance
 from stereo_points import CAMERA, noisy, scene
 
@@ -158,3 +159,21 @@ def test_nees_is_one_over_2000_trials(count: int, disparity_px: tuple[float, flo
     value = nees_per_dof(count, disparity_px, 0.5, 2000)
     print(f"NEES/dof {value:.3f}")
     assert 0.95 <= value <= 1.05
+
+
+def test_far_points_do_not_outweigh_near_ground_in_the_first_pose() -> None:
+    """220 points on the ground 1 to 3 m ahead, 8 others at 50 to 70 m: the first pose fitted as few as 110 of all."""
+    camera = StereoCamera(400.0, 400.0, 320.0, 240.0, 0.2, 640, 480)
+    for seed in range(12):
+        rng = np.random.default_rng(seed)
+        uv = np.concatenate([rng.uniform([20, 130], [620, 460], (220, 2)), rng.uniform([20, 20], [620, 95], (8, 2))])
+        d = 100.0 * (np.cos(0.35) * (uv[:, 1] - 240) / 400 + np.sin(0.35))
+        d[220:] = rng.uniform(1.1, 1.6, 8)
+        uvd = np.column_stack([uv, d])
+        T = se3.exp(np.array([0.01, 0.005, 0.05, 0.01, 0.008, 0.004]))
+        after = transfer(T, uvd, camera).uvd[:2].T + rng.normal(0, 0.1, (228, 2))
+        before = uvd + rng.normal(0, 0.1, (228, 3))
+        found = pose_from_points(triangulate(before, camera), after, camera.K, 2.0, 1000, 0)
+        assert found is not None
+        off = transfer(se3.inverse(found), before, camera).uvd[:2].T - after
+        assert (np.linalg.norm(off, axis=1) < 2.0).sum() > 220
