@@ -202,6 +202,21 @@ def whitened(motion: Motion, camera: StereoCamera) -> Whitened:
     return Whitened(moved, C, W, apply_whitener(W, motion.residuals.T), apply_whitener(W, moved.H))
 
 
+def mistakable(motion: Motion, white: Whitened) -> list[Array]:
+    """(3, N) each: covariance of a point's smoothed disparity and its residual where a part of the noise is not there,
+    though stated: what persists, then the variances of column and row. It would be zero if the noise were as stated."""
+    G, S, persistent = white.moved.G, motion.noise.S, motion.noise.persistent
+    g = persistent_direction(G)
+    gain = np.einsum("k,ikn->in", S[2], G) - persistent * g
+    gain = np.einsum("jin,jn->in", white.W, apply_whitener(white.W, gain))
+    out = [persistent * g]
+    for k in range(2):
+        q = G[:, k] * (gain * G[:, k]).sum(0)
+        q[k] += gain[k]
+        out.append(S[k, k] * q)
+    return out
+
+
 # Iterations in which the inliers may change; then they stand, or a point on the fence would keep the estimate moving.
 _CHOOSING = 6
 # Of the motion's standard deviation: a step so small has come to rest. With few or noisy points, each leaves most of

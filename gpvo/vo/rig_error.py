@@ -38,7 +38,7 @@ from numpy.typing import NDArray
 from gpvo.stats.series import median
 from gpvo.types import Array, StereoCamera
 from gpvo.vo.covariance import Blocks, Sums
-from gpvo.vo.motion import NO_TWIST, Motion, Whitened, apply_whitener, persistent_direction, right_velocity
+from gpvo.vo.motion import NO_TWIST, Motion, Whitened, apply_whitener, mistakable, right_velocity
 
 _HIGHEST = 4  # order
 POWERS = np.array([(n - j, j) for n in range(_HIGHEST + 1) for j in range(n + 1)])  # of x and y, order by order
@@ -120,21 +120,6 @@ class RigState:
     def exact(cls) -> RigState:
         """The calibration is right beyond doubt."""
         return cls(np.zeros(N_COEFFICIENTS), np.zeros((N_COEFFICIENTS, N_COEFFICIENTS)), 0.0)
-
-
-def _mistaken(motion: Motion, white: Whitened) -> list[Array]:
-    """(3, N) each: covariance of a point's smoothed disparity and its residual where a part of the noise is not there,
-    though stated: what persists, then the variances of column and row. It would be zero if the noise were as stated."""
-    G, S, persistent = white.moved.G, motion.noise.S, motion.noise.persistent
-    g = persistent_direction(G)
-    gain = np.einsum("k,ikn->in", S[2], G) - persistent * g
-    gain = np.einsum("jin,jn->in", white.W, apply_whitener(white.W, gain))
-    out = [persistent * g]
-    for k in range(2):
-        q = G[:, k] * (gain * G[:, k]).sum(0)
-        q[k] += gain[k]
-        out.append(S[k, k] * q)
-    return out
 
 
 class RigError:
@@ -254,7 +239,7 @@ class RigError:
             if sharp and near.sum() >= 8:
                 # The derivatives by the translation are in proportion to the disparity, and so to its error.
                 by_d = motion.scale_px**2 / motion.uvd_prev[:, 2] * (root / scale_px)
-                mistaken = (apply_whitener(white.W, q) * by_d for q in _mistaken(motion, white))
+                mistaken = (apply_whitener(white.W, q) * by_d for q in mistakable(motion, white))
                 dilution = np.stack([(by_motion[:, :3] * q[:, None])[..., near].sum((0, 2)) for q in mistaken], axis=1)
                 of_near = np.tile(near, 3)
                 self._learn_disparities(A[of_near], B[of_near], dilution)
