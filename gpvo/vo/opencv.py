@@ -149,14 +149,6 @@ def pose_from_points(
         return None
     if not found or inliers is None or not np.isfinite(rvec).all() or not np.isfinite(tvec).all():
         return None
-    # What OpenCV fits to the inliers at last, EPnP, errs in metres: a few far points may outweigh all near ones.
-    of = inliers[:, 0]
-    poses = [(rvec, tvec)]
-    found, *other = cv2.solvePnP(points[of], uv[of], K, None, flags=cv2.SOLVEPNP_SQPNP)
-    if found and np.isfinite(other).all():
-        poses.append((other[0], other[1]))
-    off_px = [np.linalg.norm(cv2.projectPoints(points, r, t, K, None)[0][:, 0] - uv, axis=1) for r, t in poses]
-    rvec, tvec = poses[int(np.argmax([(off < threshold_px).sum() for off in off_px]))]
     T = np.eye(4)
     T[:3, :3] = cv2.Rodrigues(rvec)[0]
     T[:3, 3] = tvec.ravel()

@@ -4,7 +4,6 @@ from gpvo.geometry import se3
 from gpvo.types import StereoCamera
 from gpvo.vo.covariance import motion_covariance
 from gpvo.vo.motion import refine, residual_covariance, transfer, whitener
-from gpvo.vo.opencv import pose_from_points
 from gpvo.vo.points import PointNoise, triangulate, triangulation_pixel_covariance
 from stereo_points import CAMERA, noisy, scene
 
@@ -65,7 +64,7 @@ def test_outliers_are_left_out() -> None:
     assert motion.scale_px == pytest.approx(0.2, rel=0.25)
 
 
-def test_an_estimate_at_rest_has_converged() -> None:
+def test_an_estimate_at_rest_has_converged(monkeypatch: pytest.MonkeyPatch) -> None:
     """80 motions of 20 points far ahead, close together, whose disparity is off by half a pixel in both frames alike.
 
     Each step then leaves most of what the one before had left. That is no doubt about the motion where it is a
@@ -79,9 +78,10 @@ def test_an_estimate_at_rest_has_converged() -> None:
         before[:, 2] = 1 / before[:, 2]
         T = start @ se3.exp(rng.normal(0, (0.05, 0.05, 0.05, 0.01, 0.01, 0.01)))
         pair = noisy(rng, before, 0.1), noisy(rng, transfer(T, before, camera).uvd.T, 0.1)
-        motion, last = (
-            refine(start, *pair, camera, noise=noise, tolerance_px=4.0, max_iterations=n) for n in (12, 200)
-        )
+        motion = refine(start, *pair, camera, noise=noise, tolerance_px=4.0)
+        with monkeypatch.context() as patch:
+            patch.setattr("gpvo.vo.motion._PATIENCE", 200)
+            last = refine(start, *pair, camera, noise=noise, tolerance_px=4.0, max_iterations=200)
         if motion is None or last is None:  # the noise may leave a motion undetermined
             continue
         off = se3.log(se3.inverse(motion.T_prev_cur) @ last.T_prev_cur)
@@ -159,21 +159,3 @@ def test_nees_is_one_over_2000_trials(count: int, disparity_px: tuple[float, flo
     value = nees_per_dof(count, disparity_px, 0.5, 2000)
     print(f"NEES/dof {value:.3f}")
     assert 0.95 <= value <= 1.05
-
-
-def test_far_points_do_not_outweigh_near_ground_in_the_first_pose() -> None:
-    """220 points on the ground 1 to 3 m ahead, 8 others at 50 to 70 m: the first pose fitted as few as 110 of all."""
-    camera = StereoCamera(400.0, 400.0, 320.0, 240.0, 0.2, 640, 480)
-    for seed in range(12):
-        rng = np.random.default_rng(seed)
-        uv = np.concatenate([rng.uniform([20, 130], [620, 460], (220, 2)), rng.uniform([20, 20], [620, 95], (8, 2))])
-        d = 100.0 * (np.cos(0.35) * (uv[:, 1] - 240) / 400 + np.sin(0.35))
-        d[220:] = rng.uniform(1.1, 1.6, 8)
-        uvd = np.column_stack([uv, d])
-        T = se3.exp(np.array([0.01, 0.005, 0.05, 0.01, 0.008, 0.004]))
-        after = transfer(T, uvd, camera).uvd[:2].T + rng.normal(0, 0.1, (228, 2))
-        before = uvd + rng.normal(0, 0.1, (228, 3))
-        found = pose_from_points(triangulate(before, camera), after, camera.K, 2.0, 1000, 0)
-        assert found is not None
-        off = transfer(se3.inverse(found), before, camera).uvd[:2].T - after
-        assert (np.linalg.norm(off, axis=1) < 2.0).sum() > 220
