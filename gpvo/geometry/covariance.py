@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from functools import cache
+
 import numpy as np
 from numpy.typing import NDArray
 
@@ -73,15 +75,18 @@ def where_stated(C: Array) -> Array:
     return np.where(are_covariances(C)[:, None, None], C, np.nan)
 
 
+_triangle = cache(np.triu_indices)  # each record asks for it four times
+
+
 def upper(C: Array) -> Array:
     """(..., n (n + 1) / 2) elements of symmetric matrices (..., n, n) on and above the diagonal, row by row."""
-    i, j = np.triu_indices(C.shape[-1])
+    i, j = _triangle(C.shape[-1])
     return np.asarray(C[..., i, j])
 
 
 def from_upper(elements: Array, n: int) -> Array:
     """(..., n, n) symmetric matrices: the inverse of :func:`upper`."""
-    i, j = np.triu_indices(n)
+    i, j = _triangle(n)
     C = np.empty((*elements.shape[:-1], n, n))
     C[..., i, j] = C[..., j, i] = elements
     return C

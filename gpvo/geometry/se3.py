@@ -19,12 +19,16 @@ from gpvo.types import Array
 # Below this angle the closed forms lose more digits to cancellation than the series drop.
 _SMALL_ANGLE_RAD = 1e-4
 _NOT_RIGID = 1e-3
+_EYE = np.eye(3)
 _SIGNS = 2.0 * np.eye(4, 3) - [[1.0], [1.0], [1.0], [-1.0]]  # of a rotation's diagonal in each squared component
 
 
 def skew(v: Array) -> Array:
     """Matrix of the cross product: ``skew(v) @ w == cross(v, w)``. (..., 3) -> (..., 3, 3)."""
     v = np.asarray(v, dtype=np.float64)
+    if v.size == 3:
+        x, y, z = v.ravel().tolist()
+        return np.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]]).reshape(*v.shape, 3)
     out = np.zeros((*v.shape[:-1], 3, 3))
     out[..., 0, 1], out[..., 0, 2] = -v[..., 2], v[..., 1]
     out[..., 1, 0], out[..., 1, 2] = v[..., 2], -v[..., 0]
@@ -61,23 +65,26 @@ def _coefficients_of_one(theta2: Array) -> tuple[Array, Array, Array]:
 
 
 def _powers(phi: Array) -> tuple[Array, Array, Array, Array, Array]:
-    """The coefficients of a rotation vector (..., 3) [rad], each (..., 1, 1), and its skew matrix and its square."""
+    """Of a rotation vector (..., 3) [rad]: the coefficients, each (..., 1, 1) or a number, its skew matrix and that
+    squared."""
     phi = np.asarray(phi, dtype=np.float64)
-    a, b, c = (v[..., None, None] for v in _coefficients((phi**2).sum(-1)))
     W = skew(phi)
+    if phi.size == 3:  # numbers do as well
+        return *_coefficients_of_one((phi**2).sum()), W, W @ W
+    a, b, c = (v[..., None, None] for v in _coefficients((phi**2).sum(-1)))
     return a, b, c, W, W @ W
 
 
 def so3_exp(phi: Array) -> Array:
     """Rotation vector [rad] to rotation matrix (Rodrigues). (..., 3) -> (..., 3, 3)."""
     a, b, _, W, WW = _powers(phi)
-    return np.eye(3) + a * W + b * WW
+    return np.asarray(_EYE + a * W + b * WW)
 
 
 def so3_exp_and_right_jacobian(phi: Array) -> tuple[Array, Array]:
     """:func:`so3_exp` and the right Jacobian, which is the left one of ``-phi``, for the price of one."""
     a, b, c, W, WW = _powers(phi)
-    return np.eye(3) + a * W + b * WW, np.eye(3) - b * W + c * WW
+    return _EYE + a * W + b * WW, _EYE - b * W + c * WW
 
 
 def so3_log(R: Array) -> Array:
@@ -127,8 +134,8 @@ def so3_left_jacobian_inverse(phi: Array) -> Array:
 def exp(xi: Array) -> Array:
     """Tangent (..., 6) to pose (..., 4, 4)."""
     xi = np.asarray(xi, dtype=np.float64)
-    (a, b, c, W, WW), eye = _powers(xi[..., 3:]), np.eye(3)
-    return from_rt(eye + a * W + b * WW, ((eye + b * W + c * WW) @ xi[..., :3, None])[..., 0])
+    a, b, c, W, WW = _powers(xi[..., 3:])
+    return from_rt(_EYE + a * W + b * WW, ((_EYE + b * W + c * WW) @ xi[..., :3, None])[..., 0])
 
 
 def log(T: Array) -> Array:
@@ -202,6 +209,10 @@ def transform(T: Array, points: Array) -> Array:
 def from_rt(R: Array, t: Array) -> Array:
     """Pose (..., 4, 4) from rotation (..., 3, 3) and translation (..., 3)."""
     R, t = np.asarray(R, dtype=np.float64), np.asarray(t, dtype=np.float64)
+    if R.ndim == 2:
+        T = np.zeros((4, 4))
+        T[:3, :3], T[:3, 3], T[3, 3] = R, t, 1.0
+        return T
     T = np.zeros((*R.shape[:-2], 4, 4))
     T[..., :3, :3], T[..., :3, 3], T[..., 3, 3] = R, t, 1.0
     return T

@@ -211,7 +211,8 @@ class Felt:
 
     def _of_lever(self) -> Array:
         """(3,) velocity of the IMU about the camera."""
-        return np.cross(self.turn_radps, self.T_cam_imu[:3, 3])
+        (x, y, z), (a, b, c) = self.turn_radps, self.T_cam_imu[:3, 3]
+        return np.array([y * c - z * b, z * a - x * c, x * b - y * a])
 
 
 def _can_be(imu: ImuMoments) -> bool:

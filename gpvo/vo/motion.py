@@ -9,6 +9,7 @@ Shafer, "Error modeling in stereo navigation", 1987, eq. 16).
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
@@ -173,6 +174,14 @@ class Motion:
     information: Array
     converged: bool
     noise: PointNoise
+
+    @cached_property
+    def worst_translation_sigma_m(self) -> float:
+        """Largest standard deviation of the translation in any direction [m], at the noise that the residuals show."""
+        info = self.information
+        marginal = info[:3, :3] - info[:3, 3:] @ np.linalg.pinv(info[3:, 3:]) @ info[3:, :3]
+        smallest = float(np.linalg.eigvalsh(marginal)[0])
+        return self.scale_px / np.sqrt(smallest) if smallest > 0 else np.inf
 
     def __str__(self) -> str:
         t = np.linalg.norm(self.T_prev_cur[:3, 3])

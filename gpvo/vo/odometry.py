@@ -27,7 +27,6 @@ from gpvo.vo.quality import (
     median_parallax_px,
     motion_fields,
     stats_fields,
-    worst_translation_sigma_m,
 )
 from gpvo.vo.rig_error import RigError, RigState
 from gpvo.vo.rivals import Choice, areas, choose, explained, unexplained, untangled
@@ -372,7 +371,7 @@ class StereoOdometry:
             return True, counts
         inliers = motion.inliers
         parallax_px = median_parallax_px(matches, inliers)
-        sigma_m = worst_translation_sigma_m(motion)
+        sigma_m = motion.worst_translation_sigma_m
         state.believe(record.t_ns, record.T_prev_cur, parallax_px, int(inliers.sum()), choice, sigma_m)
         self.rig_error.twist = state.twist
         if state.suffices(parallax_px, config) and inliers.sum() > 0.6 * state.reference_points:

@@ -83,7 +83,7 @@ def judge(
     inliers, tracked = int(motion.inliers.sum()), max(matches.n_tracked, 1)
     if inliers < config.min_inliers or inliers < 0.12 * tracked:
         return Verdict(Status.LOST, f"only {inliers} of {tracked} points agree")
-    sigma_m = worst_translation_sigma_m(motion)
+    sigma_m = motion.worst_translation_sigma_m
     if not sigma_m < 5 * camera.baseline_m or _all_at_infinity(motion):
         return Verdict(Status.LOST, "the points do not determine the translation")
     doubts = list(doubts)
@@ -118,14 +118,6 @@ def _all_at_infinity(motion: Motion) -> bool:
     n, sigma2 = len(motion.uvd_prev), motion.scale_px**2 * (1.0 + motion.noise.persistent)
     # Three standard deviations of chi-square.
     return float((motion.uvd_prev[:, 2] ** 2).sum()) < sigma2 * (n + 3.0 * np.sqrt(2.0 * n))
-
-
-def worst_translation_sigma_m(motion: Motion) -> float:
-    """Largest standard deviation of the translation in any direction [m], at the noise that the residuals show."""
-    info = motion.information
-    marginal = info[:3, :3] - info[:3, 3:] @ np.linalg.pinv(info[3:, 3:]) @ info[3:, :3]
-    smallest = float(np.linalg.eigvalsh(marginal)[0])
-    return motion.scale_px / np.sqrt(smallest) if smallest > 0 else np.inf
 
 
 def _log10_condition(information: Array, depth_m: float) -> float:

@@ -20,7 +20,6 @@ from gpvo.types import Array, StereoCamera
 from gpvo.vo.config import KNOWN_DEPTH_PX
 from gpvo.vo.frontend import Matches
 from gpvo.vo.motion import Motion, predict_uvd
-from gpvo.vo.quality import worst_translation_sigma_m
 
 _CELLS = 96  # of the whole image
 EXPLAINED = 0.8  # share of the cells; below, a rival is looked for
@@ -167,7 +166,7 @@ def choose(
     Moments of the mixture: ``sum p_i (d_i d_i^T + C_i)``, with d_i from the chosen motion to another, and C_i of the
     other's translation. ``wrong(index, goes_on)``: probability that another is the scene's, however likely this one is.
     """
-    candidates, sigma_m = [m.T_prev_cur for m in motions], [worst_translation_sigma_m(m) for m in motions]
+    candidates, sigma_m = [m.T_prev_cur for m in motions], [m.worst_translation_sigma_m for m in motions]
     weight, goes_on, tells, back = _weigh(motions, sigma_m, covered, expected)
     if len(weight) > len(motions) and expected is not None:
         candidates.append(expected.T_prev_cur)
