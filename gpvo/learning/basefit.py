@@ -97,8 +97,10 @@ def learn_domain(X: Array) -> Domain:
     The narrower range leaves out one row in five thousand at either end; both are extended by a fiftieth of its width.
     """
     X = np.where(np.isfinite(X), X, np.nan)
-    centre = np.nanmedian(X, axis=0)
-    q25, q75 = np.nanquantile(X, [0.25, 0.75], axis=0)
+    # Where nothing is missing, the plain ones say the same in a fifth of the time.
+    median, quantile = (np.nanmedian, np.nanquantile) if np.isnan(X).any() else (np.median, np.quantile)
+    centre = median(X, axis=0)
+    q25, q75 = quantile(X, [0.25, 0.75], axis=0)
     spread = np.nanstd(X, axis=0)
     # A feature that mostly rests at one value has no quartiles to speak of.
     scale = np.where((q75 - q25) / 1.349 > 0.1 * spread, (q75 - q25) / 1.349, spread)
@@ -106,7 +108,7 @@ def learn_domain(X: Array) -> Domain:
     of_constant = np.where(centre == 0.0, 1.0, 0.1 * np.abs(centre))
     scale = np.where(scale > 1e-12 * np.maximum(np.abs(centre), 1.0), scale, of_constant)
     U = (X - centre) / scale
-    low, high = np.nanquantile(U, [_RARE, 1.0 - _RARE], axis=0)
+    low, high = quantile(U, [_RARE, 1.0 - _RARE], axis=0)
     pad = 0.02 * (high - low)
     least, most = np.nanmin(U, axis=0), np.nanmax(U, axis=0)
     U = np.clip(np.nan_to_num(U), low - pad, high + pad)
