@@ -31,6 +31,12 @@ def gpvo(*arguments):
 
 
 @pytest.fixture(scope="module")
+def original(flown):
+    """What that run says of its points and their noise."""
+    return estimate(flown[0] / "run")
+
+
+@pytest.fixture(scope="module")
 def flown(tmp_path_factory):
     """A flight of eight seconds with a dark second, its run, and three twins."""
     folder = tmp_path_factory.mktemp("twins")
@@ -61,9 +67,7 @@ def test_twins_see_what_the_flight_saw(flown):
         assert (real.log.column("n_stereo") == twin.log.column("n_stereo")).all()
 
 
-def test_an_outlier_whose_landmark_lies_in_the_camera_is_not_seen(flown):
-    folder, _, _ = flown
-    original = estimate(folder / "run")
+def test_an_outlier_whose_landmark_lies_in_the_camera_is_not_seen(original):
     structure, seen = original.structure, original.seen
     odd = int(np.flatnonzero(structure.weight == 0)[0])
     points = structure.points_world.copy()
@@ -74,8 +78,7 @@ def test_an_outlier_whose_landmark_lies_in_the_camera_is_not_seen(flown):
     assert seen.track[odd] not in twin.frames[seen.frame[odd]].track
 
 
-def test_noise_of_a_point_seen_twice_keeps_the_difference_of_its_measurements(flown):
-    original = estimate(flown[0] / "run")
+def test_noise_of_a_point_seen_twice_keeps_the_difference_of_its_measurements(original):
     length = np.bincount(original.seen.track)
     used = np.bincount(original.seen.track, original.structure.weight > 0)
     twice = np.flatnonzero((length == 2) & (used == 2))
@@ -88,8 +91,7 @@ def test_noise_of_a_point_seen_twice_keeps_the_difference_of_its_measurements(fl
         assert np.abs(left.sum(axis=0)).max() < 0.5 * np.abs(left).sum() + 1e-3
 
 
-def test_equal_seeds_make_equal_bytes_and_other_replicates_other_noise(flown):
-    original = estimate(flown[0] / "run")
+def test_equal_seeds_make_equal_bytes_and_other_replicates_other_noise(flown, original):
     again = estimate(flown[0] / "run")
     one, two, other = (twin_source(o, TwinSettings(), k) for o, k in ((original, 0), (again, 0), (original, 1)))
     for a, b in zip(one.frames, two.frames, strict=True):
@@ -98,8 +100,7 @@ def test_equal_seeds_make_equal_bytes_and_other_replicates_other_noise(flown):
     assert not np.array_equal(one.frames[5].uv_left, other.frames[5].uv_left)
 
 
-def test_frames_without_tracks_stay_without(flown):
-    original = estimate(flown[0] / "run")
+def test_frames_without_tracks_stay_without(original):
     dark = [k for k, r in enumerate(original.run.log) if not r.usable and k]
     assert dark
     assert any(len(twin_source(original, TwinSettings(), 0).frames[k].track) == 0 for k in dark)
@@ -115,8 +116,7 @@ def test_a_run_that_is_lost_for_most_of_its_time_has_twins(tmp_path):
     assert np.nanmedian(original.structure.sigma_px[usable]) == pytest.approx(0.15, rel=0.4)
 
 
-def test_each_twin_draws_its_own_rig(flown):
-    original = estimate(flown[0] / "run")
+def test_each_twin_draws_its_own_rig(original):
     wide = TwinSettings(tolerance=Tolerance(baseline=0.05))
     e = rig_errors(wide)[:, :5]
     assert np.allclose(e.T @ e / len(e), np.eye(5))
@@ -128,8 +128,7 @@ def test_each_twin_draws_its_own_rig(flown):
     assert 0.01 < np.std(disparity) / np.mean(disparity) < 0.15
 
 
-def test_the_rig_of_a_twin_is_wrong_as_odometry_found_it(flown):
-    original = estimate(flown[0] / "run")
+def test_the_rig_of_a_twin_is_wrong_as_odometry_found_it(original):
     fx = original.seen.camera.fx_px
     n = N_COEFFICIENTS
     mean, covariance = np.zeros(n), np.zeros((n, n))
@@ -274,15 +273,16 @@ def test_sample_covariance_is_that_of_the_draws():
     assert np.trace(ratio, axis1=1, axis2=2).mean() / 6 == pytest.approx(1.0, abs=0.15)
 
 
-@pytest.fixture
-def blind(flown, tmp_path):
+@pytest.fixture(scope="module")
+def blind(flown, tmp_path_factory):
     """The same run without its truth."""
     from gpvo.io.run import write_run
 
     folder, real, _ = flown
-    write_run(tmp_path / "blind", real.log, config=asdict(VoConfig()), mounting=real.mounting)
-    (tmp_path / "blind" / "tracks.parquet").write_bytes((folder / "run" / "tracks.parquet").read_bytes())
-    return tmp_path / "blind"
+    path = tmp_path_factory.mktemp("blind") / "blind"
+    write_run(path, real.log, config=asdict(VoConfig()), mounting=real.mounting)
+    (path / "tracks.parquet").write_bytes((folder / "run" / "tracks.parquet").read_bytes())
+    return path
 
 
 def test_the_command_makes_runs_with_exact_truth(blind, tmp_path):
