@@ -8,14 +8,15 @@ from __future__ import annotations
 import fcntl
 import os
 import random
+import resource
 import shutil
 import signal
 import subprocess
 import sys
 import termios
 import time
-from collections.abc import Callable
-from contextlib import suppress
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import Any
 
@@ -26,6 +27,8 @@ from gpvo.files import read_json
 from gpvo.io.run import is_finished, read_run
 from gpvo.online.predictor import Predictor
 from gpvo.sim.points import simulate_points
+
+from command_line import gpvo
 
 SIGNALS = (signal.SIGKILL, signal.SIGTERM, signal.SIGINT)
 KILLS = int(os.environ.get("GPVO_KILLS", "24"))
@@ -323,6 +326,19 @@ def short(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return folder
 
 
+@contextmanager
+def files_of_at_most(size_bytes: int) -> Iterator[None]:
+    """The kernel refuses this process any byte beyond. Of bytecode, Python would keep what fits."""
+    soft, hard = resource.getrlimit(resource.RLIMIT_FSIZE)
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(sys, "dont_write_bytecode", True)
+        resource.setrlimit(resource.RLIMIT_FSIZE, (size_bytes, hard))
+        try:
+            yield
+        finally:
+            resource.setrlimit(resource.RLIMIT_FSIZE, (soft, hard))
+
+
 @pytest.mark.slow
 @pytest.mark.parametrize("name", WRITERS)
 def test_a_full_disk_costs_one_line_and_leaves_what_was_there(name: str, short: Path, tmp_path: Path) -> None:
@@ -331,11 +347,8 @@ def test_a_full_disk_costs_one_line_and_leaves_what_was_there(name: str, short: 
         shutil.copytree(short / "run0", out)
     before = bytes_of(tmp_path)
     for limit_bytes in (0, 1_000, 10_000):
-        limited = f"import resource, runpy; resource.setrlimit(resource.RLIMIT_FSIZE, ({limit_bytes}, {limit_bytes}))"
-        code = f"{limited}; runpy.run_module('gpvo', run_name='__main__')"
-        call = subprocess.run(
-            [sys.executable, "-c", code, *WRITERS[name], out], capture_output=True, text=True, cwd=short, timeout=300
-        )
+        with files_of_at_most(limit_bytes):
+            call = gpvo(*WRITERS[name], out, folder=short)
         if call.returncode == 0:
             assert limit_bytes > 0
             break
