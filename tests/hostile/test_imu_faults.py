@@ -71,8 +71,13 @@ LONG_FAULTS: dict[str, Fault] = {
 }
 
 
+@cache
+def sound(seed: int, duration_s: float) -> Flight:
+    return synthetic_flight(seed, duration_s=duration_s)
+
+
 def faulty(seed: int, fault: Fault, duration_s: float) -> Flight:
-    flight = synthetic_flight(seed, duration_s=duration_s)
+    flight = sound(seed, duration_s)
     imu = flight.imu
     t, w, f = imu.t_ns.copy(), imu.gyro_radps.copy(), imu.acc_mps2.copy()
     fault(t, w, f, round(200 * AT_S) + seed % 7)
