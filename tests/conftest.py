@@ -24,9 +24,32 @@ for folder in {Path(__file__).parents[1], *(p.parent for p in Path(__file__).par
         sys.path.append(str(folder))
 
 
+LONGEST = (
+    "test_no_mutated_input_of_many_breaks_anything",
+    "test_learned_covariance_beats_the_best_constant_where_vo_fails_for_seconds",
+    "test_everything_without_pictures",
+    "test_memory_stays_flat_over_ten_thousand_frames",
+    "test_the_learned_covariance_is_true_on_flights_not_seen",
+    "test_forecast_along_unseen_simulated_flights",
+    "test_the_stress_list_on_a_drive",
+    "test_the_stress_list",
+    "test_every_command_runs",
+    "test_thousands_of_frames",
+)
+"""Tests of a minute or more of processor time, the longest first."""
+
+
+@pytest.hookimpl(trylast=True)  # of those that are left
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
-    """Kills come first: they wait more than they compute, and at the end nothing would be left to run beside them."""
-    items.sort(key=lambda item: "kills" not in item.path.parts)
+    """Of two workers, the first begins with the kills, which wait more than they compute, and the second, which has the
+    latter half, with the longest: at the end of each half are short ones, so that both end together."""
+    kills, longest, others = [], [], []
+    for item in items:
+        name = item.name.partition("[")[0]
+        (kills if "kills" in item.path.parts else longest if name in LONGEST else others).append(item)
+    longest.sort(key=lambda item: LONGEST.index(item.name.partition("[")[0]))
+    middle = max(len(items) // 2 - len(kills), 0)
+    items[:] = [*kills, *others[:middle], *longest, *others[middle:]]
 
 
 def pytest_collection_finish() -> None:
