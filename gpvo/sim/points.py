@@ -20,7 +20,7 @@ from gpvo.geometry import se3
 from gpvo.geometry.se3 import R_FLU_OPTICAL
 from gpvo.sim import clouds, events, imu
 from gpvo.sim.events import Episode, draw_episodes
-from gpvo.sim.points_scenario import SCENARIOS, PointsScenario, check_values
+from gpvo.sim.points_scenario import PointsScenario, check_values, scenarios
 from gpvo.types import Array, ImuLog
 
 
@@ -73,14 +73,14 @@ T_BODY_CAM = se3.from_rt(R_FLU_OPTICAL, np.array([0.12, 0.0, 0.02]))
 
 
 def simulate_points(scenario: str | PointsScenario, seed: int = 0, **overrides: object) -> PointsFlight:
-    """Fly a scenario, or that of a name of :data:`SCENARIOS`, once; ``overrides``: single values of it.
+    """Fly a scenario, or that of a name of :func:`scenarios`, once; ``overrides``: single values of it.
 
     Raises GpvoError for an unknown scenario or value.
     """
     if isinstance(scenario, str):
-        if scenario not in SCENARIOS:
-            raise GpvoError(f"unknown points scenario '{scenario}'", cure=f"choose from {', '.join(SCENARIOS)}")
-        scenario = SCENARIOS[scenario]
+        if scenario not in scenarios():
+            raise GpvoError(f"unknown points scenario '{scenario}'", cure=f"choose from {', '.join(scenarios())}")
+        scenario = scenarios()[scenario]
     try:
         chosen = replace(scenario, **overrides)  # type: ignore[arg-type]
     except TypeError as error:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, replace
+from functools import cache
 from pathlib import Path
 from typing import Any
 
@@ -67,8 +68,13 @@ def _landmarks_alone(table: Mapping[str, Any]) -> PointsScenario:
 
 
 FOLDER = Path(__file__).parent / "scenarios"
-_FILES = {file.stem: read_toml(file) for file in sorted(FOLDER.glob("*.toml"))}
-SCENARIOS = {name: _landmarks_alone(table) for name, table in _FILES.items() if "landmarks" in table}
+
+
+@cache
+def scenarios() -> dict[str, PointsScenario]:
+    """Those that come with gpvo and can be flown without images, by name."""
+    tables = {file.stem: read_toml(file) for file in sorted(FOLDER.glob("*.toml"))}
+    return {name: _landmarks_alone(table) for name, table in tables.items() if "landmarks" in table}
 
 
 def _within(least: float, most: float, kind: type = float) -> Callable[[Any], bool]:

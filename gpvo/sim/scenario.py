@@ -18,7 +18,7 @@ from gpvo.files import read_toml
 from gpvo.geometry.se3 import path_length_m
 from gpvo.parallel import map_jobs
 from gpvo.sim.points import simulate_points
-from gpvo.sim.points_scenario import FOLDER, SCENARIOS, PointsScenario, check_values
+from gpvo.sim.points_scenario import FOLDER, PointsScenario, check_values, scenarios
 from gpvo.sim.rig import CAMERAS, camera_rig
 
 CalibrationKey = Literal["baseline", "focal", "rotation_rad", "distortion"]
@@ -139,7 +139,7 @@ def load_scenario(name: str, overrides: Mapping[str, Any] | None = None) -> Scen
     for beside in ("seed", "files", "drawn"):
         table.pop(beside, None)
     if file.parent == FOLDER:
-        table.pop("landmarks", None)  # SCENARIOS holds them
+        table.pop("landmarks", None)  # scenarios() holds them
     table.setdefault("name", file.stem)
     for key, value in (overrides or {}).items():
         _put(table, key, value)
@@ -156,8 +156,8 @@ def points_scenario(scenario: Scenario) -> PointsScenario:
     """The same flight without images."""
     from gpvo.cameras.rectify import Rectifier
 
-    base = SCENARIOS.get(scenario.name, PointsScenario())
-    own = load_scenario(scenario.name).camera if scenario.name in SCENARIOS else None
+    base = scenarios().get(scenario.name, PointsScenario())
+    own = load_scenario(scenario.name).camera if scenario.name in scenarios() else None
     camera = base.camera if scenario.camera == own else Rectifier(camera_rig(scenario.camera)).camera
     values: dict[str, Any] = {
         **{name: getattr(scenario, name) for name in _SHARED},

@@ -8,20 +8,20 @@ from gpvo.cameras.rectify import Rectifier
 from gpvo.errors import GpvoError
 from gpvo.sim import scenario as sc
 from gpvo.sim.points import simulate_points
-from gpvo.sim.points_scenario import _RULES, SCENARIOS, PointsScenario, check_values
+from gpvo.sim.points_scenario import _RULES, PointsScenario, check_values, scenarios
 from gpvo.sim.rig import camera_rig
 
 
 def test_every_scenario_loads_and_explains_itself():
     assert {"tunnel", "tunnel-clean", "tunnel-noise", "tunnel-bursts", "tunnel-dark"} <= set(sc.names())
     assert {"lunar-straight", "room-t265", "room-flown"} <= set(sc.names())
-    assert set(SCENARIOS) <= set(sc.names())
+    assert set(scenarios()) <= set(sc.names())
     assert all(sc.load_scenario(n).about for n in sc.names())
 
 
-@pytest.mark.parametrize("name", sorted(SCENARIOS))
+@pytest.mark.parametrize("name", sorted(scenarios()))
 def test_points_scenario_is_the_known_one(name):
-    assert sc.points_scenario(sc.load_scenario(name)) == SCENARIOS[name]
+    assert sc.points_scenario(sc.load_scenario(name)) == scenarios()[name]
 
 
 @pytest.mark.parametrize(("name", "camera"), [("tunnel-clean", "t265"), ("street", "t265"), ("room-t265", "euroc"),
@@ -74,7 +74,7 @@ def test_a_value_of_points_that_makes_no_flight_is_refused_before_any(name, valu
 def test_every_value_of_points_has_a_rule_that_the_known_flights_keep():
     ruled = [name for names, _, _ in _RULES for name in names.split()]
     assert sorted(ruled) == sorted(f.name for f in fields(PointsScenario))
-    for known in SCENARIOS.values():
+    for known in scenarios().values():
         check_values(vars(known))
 
 
