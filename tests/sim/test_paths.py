@@ -44,6 +44,7 @@ def test_speed_is_what_was_asked_for():
     assert np.linalg.norm(motion.velocity_mps[-50:], axis=1) == pytest.approx(1.0, abs=1e-6)
 
 
+@pytest.mark.filterwarnings("ignore:the path is flown at")  # made smaller, to fit
 def test_flown_path_fits_and_keeps_its_turns(tmp_path):
     t = np.arange(0, 30, 0.05)
     yaw = 0.3 * np.sin(0.4 * t)

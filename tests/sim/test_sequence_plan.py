@@ -39,6 +39,7 @@ def recording(tmp_path, suffix=".txt"):
     return file
 
 
+@pytest.mark.filterwarnings("ignore:the path is flown at")  # made smaller, to fit
 @pytest.mark.parametrize("suffix", [".txt", ".csv"])
 def test_recording_fits_into_the_pipe(tmp_path, suffix):
     scenario = load_scenario("tunnel", {"trajectory": str(recording(tmp_path, suffix)), "duration_s": 20.0})
