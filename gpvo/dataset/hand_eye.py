@@ -29,10 +29,6 @@ PRIOR_LEVER_M = 1.0
 PRIOR_WORLDS_RAD = 0.03
 MIN_MOTIONS = 10
 _ITERATIONS = 30
-# The orders in which einsum does its products; to find them took longer.
-_TO_P = ["einsum_path", (1, 2), (0, 1)]
-_TO_H = ["einsum_path", (0, 1), (1, 2), (0, 1)]
-_TO_G = ["einsum_path", (1, 3), (0, 2), (0, 1)]
 
 
 @dataclass(frozen=True)
@@ -187,7 +183,7 @@ def _in_one_world(B: Array, attitudes: Array, R: Array) -> tuple[Array, Array]:
     window's end the residual is less by it.
     """
     start = attitudes @ np.swapaxes(B[:, :3, :3], 1, 2)
-    p = np.einsum("kj,mkl,ml->mj", R, start, B[:, :3, 3], optimize=_TO_P)
+    p = np.einsum("kj,mkl,ml->mj", R, start, B[:, :3, 3], optimize=True)
     told, by_R = B.copy(), np.zeros((len(B), 6, 3))
     told[:, :3, 3] = np.einsum("mji,mj->mi", start, p)
     by_R[:, :3] = -np.swapaxes(attitudes, 1, 2) @ se3.skew(p)
@@ -200,8 +196,8 @@ def _normal_equations(r: Array, J: Array, scale: Array, X: Array, R_worlds: Arra
     w = np.repeat(1.0 / scale**2, 3)
     q = (r**2 * w).sum(1) / 6.0
     weight = 1.0 / (1.0 + q / 4.0)
-    H = np.einsum("m,mki,k,mkj->ij", weight, J, w, J, optimize=_TO_H)
-    g = np.einsum("m,mki,k,mk->i", weight, J, w, r, optimize=_TO_G)
+    H = np.einsum("m,mki,k,mkj->ij", weight, J, w, J, optimize=True)
+    g = np.einsum("m,mki,k,mk->i", weight, J, w, r, optimize=True)
     # The step moves the origin by R d: the prior is on the length of the lever arm.
     R, t = X[:3, :3], X[:3, 3]
     H[:3, :3] += np.eye(3) / PRIOR_LEVER_M**2

@@ -112,10 +112,11 @@ def _samples(imu: ImuLog) -> Iterator[Finding]:
         every = bool(bad.mean() > 0.5)
         text = f"{int(bad.sum())} of {len(imu.t_ns)} IMU samples are not finite and are dropped"
         yield Finding("imu", text, "run without it: --no-imu" if every else "", fatal=every)
-    if n := int((saturated(imu) & usable(imu)).sum()):
+    good = usable(imu)
+    if n := int((saturated(imu) & good).sum()):
         text = f"{counted(n, 'IMU sample')} of {len(imu.t_ns)} at the end of the sensor's range, counted as missing"
         yield Finding("saturated", text, "set a wider range", fatal=False)
-    beyond = int((~bad & ~usable(imu)).sum())
+    beyond = int((~bad & ~good).sum())
     if 0 < beyond <= 0.5 * len(imu.t_ns):  # More than that are in another unit.
         text = f"IMU samples out of range or out of order, counted as missing: {beyond} of {len(imu.t_ns)}"
         yield Finding("imu", text, fatal=False)

@@ -209,10 +209,6 @@ def transform(T: Array, points: Array) -> Array:
 def from_rt(R: Array, t: Array) -> Array:
     """Pose (..., 4, 4) from rotation (..., 3, 3) and translation (..., 3)."""
     R, t = np.asarray(R, dtype=np.float64), np.asarray(t, dtype=np.float64)
-    if R.ndim == 2:
-        T = np.zeros((4, 4))
-        T[:3, :3], T[:3, 3], T[3, 3] = R, t, 1.0
-        return T
     T = np.zeros((*R.shape[:-2], 4, 4))
     T[..., :3, :3], T[..., :3, 3], T[..., 3, 3] = R, t, 1.0
     return T

@@ -117,6 +117,11 @@ def projection_jacobian(P: Array, camera: StereoCamera) -> Array:
     return J
 
 
+def pose_jacobian(P: Array) -> Array:
+    """Derivative (M, 3, 6) of points (M, 3) in the camera by a right perturbation of its pose."""
+    return np.concatenate([-np.broadcast_to(np.eye(3), (len(P), 3, 3)), se3.skew(P)], axis=2)
+
+
 def summed(blocks: Array, index: NDArray[np.int64], count: int) -> Array:
     """(count, ...) blocks (M, ...), those of equal ``index`` (M,) added."""
     m = len(index)
@@ -178,7 +183,7 @@ class NormalEquations:
             P, root = now.in_camera(part), root_weight[rows]
             r = (root[:, None] * ((part.uvd - seen.camera.project(P)) @ WHITEN.T))[:, :, None]
             slope = root[:, None, None] * (WHITEN @ projection_jacobian(P, seen.camera))
-            A = slope @ np.concatenate([-np.broadcast_to(np.eye(3), (len(P), 3, 3)), se3.skew(P)], axis=2)
+            A = slope @ pose_jacobian(P)
             A[part.frame == 0] = 0.0  # the first pose stays
             D = slope @ np.swapaxes(R[part.frame], 1, 2) @ lift[part.track]
             At, Dt = np.swapaxes(A, 1, 2), np.swapaxes(D, 1, 2)

@@ -25,8 +25,7 @@ from numpy.typing import NDArray
 from scipy.optimize import nnls
 from scipy.signal import lfilter
 
-from gpvo.geometry import se3
-from gpvo.twin.bundle import WHITEN, Observations, projection_jacobian
+from gpvo.twin.bundle import WHITEN, Observations, pose_jacobian, projection_jacobian
 from gpvo.twin.noise import Neighbours, Structure, draw_signs
 from gpvo.types import Array
 from gpvo.vo.points import point_jacobian
@@ -176,7 +175,7 @@ def _modes(
         run, noise = ((r[b] - (G @ r[a][:, :, None])[:, :, 0]) @ W.T for r in (structure.residual_px, noise_px))
         # Huber's weights: the same for a residual and its opposite, so for all draws.
         w = np.minimum(1.0, _LARGEST / np.maximum(np.linalg.norm(run, axis=1), 1e-9))[:, None, None]
-        A = w * (W @ J @ np.concatenate([-np.broadcast_to(np.eye(3), J.shape), se3.skew(P[b])], axis=2))
+        A = w * (W @ J @ pose_jacobian(P[b]))
         F = (w * (W[:, :, None] * B[b, None, None, :]).reshape(len(a), 3, 18)).reshape(-1, 18)
         Q = np.linalg.qr(A.reshape(-1, 6))[0]
         F -= Q @ (Q.T @ F)

@@ -22,7 +22,17 @@ from scipy import sparse
 from scipy.spatial import cKDTree
 
 from gpvo.geometry import se3
-from gpvo.twin.bundle import WHITEN, Chart, Estimate, NormalEquations, Observations, Pieces, projection_jacobian, summed
+from gpvo.twin.bundle import (
+    WHITEN,
+    Chart,
+    Estimate,
+    NormalEquations,
+    Observations,
+    Pieces,
+    pose_jacobian,
+    projection_jacobian,
+    summed,
+)
 from gpvo.types import Array
 from gpvo.vo.motion import CHI2_3_999, CHI2_3_MEDIAN, huber
 
@@ -147,8 +157,7 @@ def restored(seen: Observations, structure: Structure) -> Array:
 def _pose_slopes(seen: Observations, structure: Structure, root_weight: Array) -> Array:
     """(M, 3, 6) derivatives of whitened (u, v, d), times ``root_weight`` (M,), by the pose of the frame."""
     P = structure.in_camera(seen)
-    by_pose = np.concatenate([-np.broadcast_to(np.eye(3), (len(P), 3, 3)), se3.skew(P)], axis=2)
-    slopes: Array = root_weight[:, None, None] * (WHITEN @ projection_jacobian(P, seen.camera) @ by_pose)
+    slopes: Array = root_weight[:, None, None] * (WHITEN @ projection_jacobian(P, seen.camera) @ pose_jacobian(P))
     return slopes
 
 

@@ -233,7 +233,7 @@ def _centred(x: Array) -> Array:
 
 def _usual(x: Array) -> NDArray[np.bool_]:
     """Which of these deviations from a median are within four of their standard deviations."""
-    return np.abs(x) <= 4 * 1.4826 * np.median(np.abs(x)) if len(x) else np.zeros(0, bool)
+    return np.asarray(np.abs(x) <= 4 * 1.4826 * median(np.abs(x)))
 
 
 def motion_fields(matches: Matches, motion: Motion, camera: StereoCamera, moments: ResidualMoments) -> dict[str, Any]:
