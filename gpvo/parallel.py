@@ -66,8 +66,10 @@ def map_jobs(
     with warnings.catch_warnings():
         # A process that has grown is renewed between two jobs: nothing is lost, and nothing is to be done about it.
         warnings.filterwarnings("ignore", "A worker stopped while some jobs", UserWarning)
+        # Ctrl-C reaches workers too; this process alone heeds it, and ends them.
+        deaf = {"initializer": signal.signal, "initargs": (signal.SIGINT, signal.SIG_IGN)}
         try:
-            return _told(Parallel(n_jobs=jobs, return_as="generator")(calls), on_done)
+            return _told(Parallel(n_jobs=jobs, return_as="generator", **deaf)(calls), on_done)
         except BrokenProcessPool:
             raise GpvoError(_KILLED, cure="run it again, with fewer --jobs") from None
 
