@@ -227,8 +227,10 @@ class OdometryOptions:
     methods: Annotated[str, "Covariances: triangulation, pointing_matching, spherical."] = (
         "triangulation,pointing_matching"
     )
-    sigma_p: Annotated[str, "Pointing noise [px], or auto (estimated from the residuals)."] = "0.1"
-    sigma_m: Annotated[str, "Matching noise [px], or auto."] = "0.5"
+    sigma_p: Annotated[
+        str | None, "Pointing noise [px], or auto: estimated from the residuals, the default; 0.1 with --preset thesis."
+    ] = None
+    sigma_m: Annotated[str | None, "Matching noise [px], or auto: the default; 0.5 with --preset thesis."] = None
     sigma: Annotated[float, "Pixel noise of the triangulation method [px]."] = 1.0
     min_inliers: Annotated[int, "A motion with fewer inliers is lost; at least 4."] = 8
     weak_inliers: Annotated[int, "A motion with fewer inliers is degraded."] = 20

@@ -41,8 +41,8 @@ class VoConfig:
     keyframe_parallax_px: float = within(1.0, 0, 1000)  # of the median point: below, the reference is kept; 0: never
     methods: tuple[str, ...] = ("triangulation", "pointing_matching")
     sigma_px: float = within(1.0, 1e-6, 100)  # triangulation: of each image coordinate
-    sigma_p_px: float | None = within(0.1, 1e-6, 100)  # pointing; None: estimated from the residuals so far
-    sigma_m_px: float | None = within(0.5, 1e-6, 100)  # matching; None: likewise
+    sigma_p_px: float | None = within(None, 1e-6, 100)  # pointing; None: estimated from the residuals so far
+    sigma_m_px: float | None = within(None, 1e-6, 100)  # matching; None: likewise
     sigma_pairs_px: tuple[tuple[float, float], ...] = ()  # further pairs, each stated as a method of its own
     self_calibration: bool = True  # estimate what the calibration has wrong between the cameras
     persistent_noise: bool = True  # estimate the error of disparity that a point keeps while it is followed
@@ -74,6 +74,8 @@ PRESETS: dict[str, VoConfig] = {
         max_features=500,
         min_disparity_px=KNOWN_DEPTH_PX,
         ransac_iterations=150,
+        sigma_p_px=0.1,
+        sigma_m_px=0.5,
         self_calibration=False,
         persistent_noise=False,
     ),
@@ -117,7 +119,9 @@ def read_settings(texts: Sequence[str]) -> dict[str, Any]:
         try:
             out[name] = _read(value, kinds[name])
         except (KeyError, ValueError):
-            raise GpvoError(f"{name} cannot be '{value}'", cure=f"its default is {getattr(VoConfig(), name)}") from None
+            usual = getattr(VoConfig(), name)
+            cure = f"its default is {'auto' if usual is None else usual}"
+            raise GpvoError(f"{name} cannot be '{value}'", cure=cure) from None
     return out
 
 

@@ -621,6 +621,12 @@ def test_a_model_knows_the_odometry_that_it_was_trained_on(tmp_path: Path) -> No
     (told,) = (problem for problem in check(predictor, runs[2]).problems if "settings" in problem)
     assert "keyframe_parallax_px is 0.0, not 1.0" in told
     assert "self_calibration is False, not True" in told
+    # The noise of a covariance matters only to a model that reads it.
+    reads = {}
+    for method, setting in (("triangulation", "sigma_px"), ("pointing_matching", "sigma_p_px")):
+        reads[method] = any(method in name for name in predictor.features)
+        assert bool(odometry_problems(predictor, {**runs[0].settings, setting: 0.3})) == reads[method], method
+    assert sorted(reads.values()) == [False, True]
     # Scores on what it learned from say nothing about others: a copy under another name is known by its rows.
     (tmp_path / "a").rename(tmp_path / "copy")
     assert any("learned from this very run" in p for p in check(predictor, read_run(tmp_path / "copy")).problems)
