@@ -24,7 +24,7 @@ import numpy as np
 import psutil
 from gpvo.dataset.build import build
 from gpvo.geometry import se3
-from gpvo.io.foreign import T_FLU_OPTICAL
+from gpvo.geometry.se3 import T_FLU_OPTICAL
 from gpvo.learning.config import TrainConfig
 from gpvo.learning.train import train_sets
 from gpvo.online import modelfile

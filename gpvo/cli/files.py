@@ -18,7 +18,8 @@ from gpvo.dataset.errors import held_poses, interpolate_truth
 from gpvo.dataset.hand_eye import FixedTransform, align_frames
 from gpvo.errors import GpvoError, SourceError, counted
 from gpvo.files import plain
-from gpvo.io.foreign import COVARIANCE_AXES, PLACES, T_FLU_OPTICAL, ForeignLog, check_same_rows, read_foreign
+from gpvo.geometry.se3 import T_FLU_OPTICAL
+from gpvo.io.foreign import COVARIANCE_AXES, PLACES, ForeignLog, check_same_rows, read_foreign
 from gpvo.io.foreign_csv import NO_HEADER
 from gpvo.io.run import Run, copy_run, read_run, write_run
 from gpvo.io.run_read import is_run

@@ -19,7 +19,7 @@ from gpvo.accumulation import along
 from gpvo.errors import GpvoError, SourceError
 from gpvo.geometry import se3
 from gpvo.geometry.covariance import position_in_world, symmetrise, variances
-from gpvo.io.foreign import T_FLU_OPTICAL
+from gpvo.geometry.se3 import T_FLU_OPTICAL
 from gpvo.io.trajectory import Trajectory, read_tum
 from gpvo.learning.sample import TrainingSample
 from gpvo.online.base import TWIST_COLUMNS, positions

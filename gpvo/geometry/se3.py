@@ -304,8 +304,10 @@ R_FRD_FLU: Array = np.diag([1.0, -1.0, -1.0])
 R_NED_ENU: Array = np.array([[0.0, 1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, -1.0]])
 # RealSense T265 pose stream (x right, y up, z back) to FLU.
 R_FLU_T265: Array = np.array([[0.0, 0.0, -1.0], [-1.0, 0.0, 0.0], [0.0, 1.0, 0.0]])
-for _R in (R_FLU_OPTICAL, R_FRD_FLU, R_NED_ENU, R_FLU_T265):
-    _R.setflags(write=False)
+# FLU body at the camera's own place, looking forward.
+T_FLU_OPTICAL: Array = from_rt(R_FLU_OPTICAL, np.zeros(3))
+for _M in (R_FLU_OPTICAL, R_FRD_FLU, R_NED_ENU, R_FLU_T265, T_FLU_OPTICAL):
+    _M.setflags(write=False)
 
 
 def rotate_covariance(R_new_old: Array, covariance: Array, of_rotation: Array | None = None) -> Array:

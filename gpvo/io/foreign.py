@@ -15,7 +15,7 @@ from gpvo.errors import SourceError, counted
 from gpvo.geometry import covariance as transport
 from gpvo.geometry import se3
 from gpvo.geometry.covariance import variances
-from gpvo.geometry.se3 import R_FLU_OPTICAL
+from gpvo.geometry.se3 import T_FLU_OPTICAL
 from gpvo.io.bag_messages import covariances_of, read_poses
 from gpvo.io.bag_reader import ODOMETRY_TYPE, POSE_TYPES, is_bag, open_bag, topics_of
 from gpvo.io.foreign_csv import POSITIONS_ALONE, Table, names_other_columns, read_table
@@ -32,8 +32,6 @@ _READ_BY = {
     "--covariance-axes": ("csv", "bag"),
 }
 COVARIANCE_AXES = ("auto", "world", "body", "mixed")
-# FLU body at the camera's own place, looking forward.
-T_FLU_OPTICAL: Array = se3.from_rt(R_FLU_OPTICAL, np.zeros(3))
 PLACES = {
     "cam": np.eye(4),
     "body": T_FLU_OPTICAL,

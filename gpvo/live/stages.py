@@ -22,9 +22,10 @@ from gpvo.geometry.covariance import (
     is_symmetric,
     symmetrise,
 )
+from gpvo.geometry.se3 import T_FLU_OPTICAL
 from gpvo.io.bag_messages import pose_of
 from gpvo.io.bag_reader import stamp_ns
-from gpvo.io.foreign import T_FLU_OPTICAL, definite_in_plane, into_body, is_optical, moving_frame
+from gpvo.io.foreign import definite_in_plane, into_body, is_optical, moving_frame
 from gpvo.io.stated import is_turn_unknown
 from gpvo.io.trajectory import FARTHEST_M
 from gpvo.live.intake import CONFIRM, Arrival, Sequence, StampWatch

@@ -13,10 +13,10 @@ import numpy as np
 from gpvo.cameras.readers import CameraInfo, read_projections, read_stereo_yaml, rig_from_camera_info
 from gpvo.cameras.rectify import Rectifier, read_mask
 from gpvo.cameras.rig import StereoRig
+from gpvo.geometry.se3 import T_FLU_OPTICAL
 from gpvo.io.bag_messages import PairQueue, accelerometer_beside, decode_message, encoding_of, with_accelerometer
 from gpvo.io.bag_reader import stamp_ns
 from gpvo.io.bags import camera_info_of, has_word, info_topic
-from gpvo.io.foreign import T_FLU_OPTICAL
 from gpvo.io.images import SWAPPED, Image8, OrderCheck
 from gpvo.io.source import Depth, SourceReport
 from gpvo.io.stamps import PAIR_TOLERANCE_S, Stamps, no_pair, tolerance_ns

@@ -22,8 +22,8 @@ from gpvo.errors import GpvoError, MissingExtraError, require
 from gpvo.files import replacing
 from gpvo.geometry import se3
 from gpvo.geometry.covariance import upper
-from gpvo.geometry.se3 import R_FLU_OPTICAL, R_FRD_FLU, rotate_covariance
-from gpvo.io.foreign import T_FLU_OPTICAL, is_optical
+from gpvo.geometry.se3 import R_FLU_OPTICAL, R_FRD_FLU, T_FLU_OPTICAL, rotate_covariance
+from gpvo.io.foreign import is_optical
 from gpvo.publish.odometry import Odometry
 from gpvo.types import Array
 

@@ -11,8 +11,7 @@ from gpvo.accumulation import PoseError, between_ends, carry
 from gpvo.errors import GpvoError
 from gpvo.geometry import se3
 from gpvo.geometry.covariance import is_positive_definite, lost_covariance, symmetrise
-from gpvo.geometry.se3 import rotate_covariance
-from gpvo.io.foreign import T_FLU_OPTICAL
+from gpvo.geometry.se3 import T_FLU_OPTICAL, rotate_covariance
 from gpvo.types import IMPORTED_POSE, Array, MotionError, Prediction, Status, VoRecord
 
 

@@ -86,13 +86,12 @@ def read_recording(file: Path, duration_s: float, rest_s: float = 3.0) -> Record
 
 def _read(path: Path) -> tuple[Array, Array]:
     """Times (N,) [s] from 0 and poses (N, 4, 4) of a body (forward, left, up) in a world whose z points up."""
-    from gpvo.io.foreign import T_FLU_OPTICAL
     from gpvo.io.run_read import is_run, read_run
     from gpvo.io.trajectory import read_euroc_csv, read_tum
 
     if is_run(path):
         log = read_run(path).log
-        return (log.t_ns - log.t_ns[0]) * 1e-9, T_FLU_OPTICAL @ log.trajectory() @ T_FLU_OPTICAL.T
+        return (log.t_ns - log.t_ns[0]) * 1e-9, se3.T_FLU_OPTICAL @ log.trajectory() @ se3.T_FLU_OPTICAL.T
     recorded = read_euroc_csv(path) if path.suffix.lower() == ".csv" else read_tum(path)
     return (recorded.t_ns - recorded.t_ns[0]) * 1e-9, recorded.T_world_body
 

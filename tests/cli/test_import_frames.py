@@ -12,8 +12,8 @@ import sequences as seq
 from bag_maker import BagMaker
 from gpvo.cli import app
 from gpvo.geometry import se3
+from gpvo.geometry.se3 import T_FLU_OPTICAL
 from gpvo.io.bag_reader import ODOMETRY_TYPE, messages, open_bag
-from gpvo.io.foreign import T_FLU_OPTICAL
 from gpvo.io.run import read_run
 from gpvo.io.trajectory import write_tum
 from typer.testing import CliRunner

@@ -13,8 +13,7 @@ import numpy as np
 import pytest
 from gpvo.errors import GpvoError
 from gpvo.geometry import se3
-from gpvo.geometry.se3 import R_FLU_OPTICAL, rotate_covariance
-from gpvo.io.foreign import T_FLU_OPTICAL
+from gpvo.geometry.se3 import R_FLU_OPTICAL, T_FLU_OPTICAL, rotate_covariance
 from gpvo.publish.mavlink import COMPONENT, Link, Sender, quality, write_tlog
 from gpvo.publish.odometry import Odometry
 from gpvo.publish.ros import register_px4, vehicle_odometry

@@ -9,7 +9,7 @@ import pytest
 from bench.shim_experiment import run
 from gpvo.files import read_json
 from gpvo.geometry import se3
-from gpvo.io.foreign import T_FLU_OPTICAL
+from gpvo.geometry.se3 import T_FLU_OPTICAL
 from gpvo.io.trajectory import write_tum
 from synthetic_runs import make_run
 

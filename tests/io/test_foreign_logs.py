@@ -11,7 +11,8 @@ from foreign_trajectories import write_euroc_csv, write_kitti_poses
 from gpvo.cli.files import import_log
 from gpvo.errors import SourceError
 from gpvo.geometry import covariance, se3
-from gpvo.io.foreign import T_FLU_OPTICAL, check_same_rows, guess_format, read_foreign
+from gpvo.geometry.se3 import T_FLU_OPTICAL
+from gpvo.io.foreign import check_same_rows, guess_format, read_foreign
 from gpvo.io.stamps import cure_of_seconds, likely_unit
 from gpvo.io.stated import to_records
 from gpvo.io.trajectory import write_tum

@@ -10,7 +10,7 @@ import numpy as np
 from bag_maker import BagMaker
 from gpvo.dataset.build import build
 from gpvo.geometry import se3
-from gpvo.io.foreign import T_FLU_OPTICAL
+from gpvo.geometry.se3 import T_FLU_OPTICAL
 from gpvo.learning.config import TrainConfig
 from gpvo.learning.train import train_sets
 from gpvo.live.engine import Engine, EngineSettings, Health

@@ -12,8 +12,9 @@ import pytest
 from bag_maker import BagMaker, stereo_bag
 from gpvo.errors import GpvoError
 from gpvo.geometry import se3
+from gpvo.geometry.se3 import T_FLU_OPTICAL
 from gpvo.io.bag_reader import open_bag
-from gpvo.io.foreign import T_FLU_OPTICAL, read_foreign
+from gpvo.io.foreign import read_foreign
 from gpvo.live import LiveSettings
 from gpvo.live.engine import Engine
 from gpvo.live.intake import Arrival

@@ -13,7 +13,7 @@ from bag_maker import BagMaker
 from gpvo.cli import app
 from gpvo.errors import GpvoError
 from gpvo.geometry import se3
-from gpvo.io.foreign import T_FLU_OPTICAL
+from gpvo.geometry.se3 import T_FLU_OPTICAL
 from gpvo.io.trajectory import write_tum
 from gpvo.live.doctor import Stated, examine, examine_bag
 from gpvo.publish.odometry import Odometry

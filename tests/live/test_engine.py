@@ -20,10 +20,10 @@ from gpvo.errors import GpvoError, SourceError
 from gpvo.files import read_json, write_json
 from gpvo.geometry import se3
 from gpvo.geometry.covariance import is_positive_definite
-from gpvo.geometry.se3 import rotate_covariance
+from gpvo.geometry.se3 import T_FLU_OPTICAL, rotate_covariance
 from gpvo.io.bag_reader import ODOMETRY_TYPE, open_bag, stamp_ns
 from gpvo.io.bag_reader import messages as read
-from gpvo.io.foreign import T_FLU_OPTICAL, read_foreign
+from gpvo.io.foreign import read_foreign
 from gpvo.io.stated import to_records
 from gpvo.live import LiveSettings, job, outputs
 from gpvo.live.engine import Engine, EngineSettings

@@ -10,8 +10,8 @@ from itertools import pairwise
 import numpy as np
 import pytest
 from gpvo.geometry import se3
+from gpvo.geometry.se3 import T_FLU_OPTICAL
 from gpvo.io.bag_reader import stamp_ns
-from gpvo.io.foreign import T_FLU_OPTICAL
 from gpvo.live.engine import Engine
 from gpvo.live.intake import Arrival, Mailbox, Sequence, StampWatch
 from gpvo.live.stages import PoseStage
