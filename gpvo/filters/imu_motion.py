@@ -92,7 +92,8 @@ def clock_shift(flight: Flight, imu: ImuLog) -> ClockShift | None:
 
 
 def jerks(flight: Flight, imu: ImuLog, window_s: float) -> tuple[Array, Array]:
-    """VO's jerk and the slope of the specific force (M, 3) [m/s^3], in camera axes at the start of each window.
+    """VO's jerk (M, 3) and the slope of the specific force (M, 3, 3, 3) [m/s^3] in camera axes at the start of each
+    window: [m, :, i, j] is that of the force that the log calls j, where it lies along axis i of the IMU.
 
     VO's motion is taken to be a cubic over ``window_s``.
     """
@@ -107,10 +108,10 @@ def jerks(flight: Flight, imu: ImuLog, window_s: float) -> tuple[Array, Array]:
         T = np.array(list(accumulate((r.T_prev_cur for r in window[1:]), np.matmul, initial=np.eye(4))))
         middle = 0.5 * (t[1:] + t[:-1])
         felt = np.diff(interpolated(t, t_imu, impulse), axis=0) / np.diff(t)[:, None]
-        force = (T[1:, :3, :3] @ (R_cam_imu @ felt.T).T[:, :, None])[:, :, 0]
-        found.append((6.0 * np.polyfit(t - t[0], T[:, :3, 3], 3)[0], np.polyfit(middle - t[0], force, 1)[0]))
-    jerk, slope = (np.array([f[i] for f in found]).reshape(-1, 3) for i in (0, 1))
-    return jerk, slope
+        force = (T[1:, :3, :3] @ R_cam_imu)[..., None] * felt[:, None, None]
+        slope = np.polyfit(middle - t[0], force.reshape(len(felt), 27), 1)[0]
+        found.append((6.0 * np.polyfit(t - t[0], T[:, :3, 3], 3)[0], slope))
+    return np.array([f[0] for f in found]).reshape(-1, 3), np.array([f[1] for f in found]).reshape(-1, 3, 3, 3)
 
 
 def _unbroken(records: Sequence[VoRecord], window_s: float) -> Iterator[list[VoRecord]]:

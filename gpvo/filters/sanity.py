@@ -5,7 +5,7 @@ axes, judged by gravity and by the motion of VO.
 from __future__ import annotations
 
 from collections.abc import Iterator
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from itertools import accumulate, permutations, product
 
 import numpy as np
@@ -328,16 +328,18 @@ def _accelerometer_sign(flight: Flight, imu: ImuLog) -> Iterator[Finding]:
     Both are compared by their slopes, from which gravity and constant biases are gone. Of short windows, in which VO's
     noise weighs more, nothing fatal is said.
     """
-    counts = ((window_s, len(jerks(flight, imu, window_s)[0])) for window_s in _WINDOWS_S)
-    window_s, n = next((found for found in counts if found[1] >= _MIN_WINDOWS), (0.0, 0))
-    if not n:
+    for window_s in _WINDOWS_S:
+        jerk, slope = jerks(flight, imu, window_s)
+        if len(jerk) >= _MIN_WINDOWS:
+            break
+    else:
         return
-    correlation = _rises_together(flight, imu, window_s)
+    correlation = _rises_together(jerk, slope, np.eye(3))
     # By chance the correlation of n pairs of values deviates from zero by 1 / sqrt(n).
-    chance = max(0.3, 3.0 / np.sqrt(3 * n))
+    chance = max(0.3, 3.0 / np.sqrt(jerk.size))
     if correlation > 1.0 - chance:
         return
-    renamed = [_rises_together(flight, replace(imu, acc_mps2=imu.acc_mps2 @ M.T), window_s) for M in _RELABELLINGS]
+    renamed = [_rises_together(jerk, slope, M) for M in _RELABELLINGS]
     best = int(np.argmax(renamed))
     is_clear = 1.0 - renamed[best] ** 2 < _EXPLAINED * (1.0 - correlation**2)
     if is_clear and renamed[best] > max(correlation + chance, renamed[-1] + _AS_WELL):  # the last: all turned around
@@ -348,8 +350,8 @@ def _accelerometer_sign(flight: Flight, imu: ImuLog) -> Iterator[Finding]:
         cure = "accelerometer and gyroscope axes differ: swapped axes"
         yield Finding("acc_axes", text, cure, fatal=window_s == _WINDOWS_S[0])
     elif correlation < -chance:
-        flipped = (replace(imu, acc_mps2=imu.acc_mps2 * (1 - 2 * axis)) for axis in np.eye(3))
-        shows = [name for name, one in zip("xyz", flipped) if _rises_together(flight, one, window_s) > 0.3]
+        flipped = (np.diag(1 - 2 * axis) for axis in np.eye(3))
+        shows = [name for name, M in zip("xyz", flipped) if _rises_together(jerk, slope, M) > 0.3]
         text = f"the accelerometer falls where VO's motion rises (correlation {correlation:.2f}): its sign is wrong"
         cure = "multiply its three axes by -1"
         if shows:  # along gravity, which hides the others
@@ -358,10 +360,11 @@ def _accelerometer_sign(flight: Flight, imu: ImuLog) -> Iterator[Finding]:
         yield Finding("acc_sign", text, cure, fatal=window_s == _WINDOWS_S[0])
 
 
-def _rises_together(flight: Flight, imu: ImuLog, window_s: float) -> float:
-    """Correlation of VO's jerk with the slope of the force."""
+def _rises_together(jerk: Array, slope: Array, M: Array) -> float:
+    """Correlation of VO's jerk with the slope of the force whose axes M renames."""
     # No window counts for more than three usual ones: in some VO may have failed.
-    a, b = (v / np.maximum(np.linalg.norm(v, axis=1), 3 * _usual(v))[:, None] for v in jerks(flight, imu, window_s))
+    both = jerk, np.einsum("mcij,ij->mc", slope, M)
+    a, b = (v / np.maximum(np.linalg.norm(v, axis=1), 3 * _usual(v))[:, None] for v in both)
     return float((a * b).sum() / np.sqrt((a**2).sum() * (b**2).sum() + 1e-300))
 
 
