@@ -66,25 +66,15 @@ class Output(Protocol):
         return
 
 
-@dataclass(frozen=True)
-class EngineSettings:
-    """``increment``: the pose's covariance is that of its last motion, not accumulated since the start.
-
-    ``state``: file that holds where the odometry stood and what late truth taught; taken up at the start, written every
-    10 s and at the end. ``vehicle``: what slips are told by.
-    """
-
-    increment: bool = False
-    state: Path | None = None
-    vehicle: Vehicle = VEHICLES["any"]
-
-
 class Engine:
     """Steps stage, predictor and message builder, and hands the results to the outputs.
 
     The pose that is published never jumps: where the source starts again, or was away, an unknown motion stands
     between, with the covariance of what may have happened. ``truth`` adapts the predictor's scale.
     ``tell``: called with each warning, at once and then every 10 s while it holds. ``topics``: those that should come.
+    ``increment``: the pose's covariance is that of its last motion, not accumulated since the start. ``state``: file
+    that holds where the odometry stood and what late truth taught; taken up at the start, written every 10 s and at the
+    end. ``vehicle``: what slips are told by.
     """
 
     def __init__(
@@ -92,13 +82,16 @@ class Engine:
         stage: Stage,
         predictor: Predictor,
         outputs: Iterable[Output],
-        settings: EngineSettings | None = None,
+        *,
         tell: Callable[[str], None] = print,
         truth: LateTruth | None = None,
         topics: Iterable[str] = (),
+        increment: bool = False,
+        state: Path | None = None,
+        vehicle: Vehicle = VEHICLES["any"],
     ) -> None:
         self.stage, self.predictor, self.outputs = stage, predictor, list(outputs)
-        self.settings = settings or EngineSettings()
+        self._increment, self._state, self._vehicle = increment, state, vehicle
         self.counts: Counter[str] = Counter()
         self.sources: list[Mapping[str, int]] = [stage.counts, self.counts]
         self.last: Odometry | None = None
@@ -115,7 +108,7 @@ class Engine:
         self._reported = (-np.inf, 0)  # seconds and level of the last health
         self._misfit: list[str] = []
         self._saved_s = -np.inf
-        self._resume = load_state(self.settings.state)
+        self._resume = load_state(state)
         self._scale = np.ones(6) if self._resume is None else self._resume.scale
         # Of the body, as last measured; before that, one as fast as vehicles were in training.
         usual = np.sqrt(predictor.model.velocities.usual_rate_var)
@@ -179,7 +172,7 @@ class Engine:
     def _step(self, taken: Taken) -> Odometry:
         builder = self._builder
         if taken.begins:
-            self.predictor.reset(self.stage.camera, self._scale, self.settings.vehicle)
+            self.predictor.reset(self.stage.camera, self._scale, self._vehicle)
             if self._truth is not None:
                 self._truth.forget()
         if builder is None:
@@ -200,7 +193,7 @@ class Engine:
             self._motions.append(record)
             self._inside.append(message.in_domain is None or message.in_domain > 0.5)
         # What is kept, also in the state, is the accumulated one: the next session begins with it.
-        sent = self._of_increment(message, record, prediction) if self.settings.increment else message
+        sent = self._of_increment(message, record, prediction) if self._increment else message
         self._deliver(lambda output: output.odometry(sent))
         return sent
 
@@ -264,7 +257,7 @@ class Engine:
             self._reported = (now_s, level)
             report = self._health(level, problems)
             self._deliver(lambda output: output.health(report))
-        if self.settings.state is not None and now_s - self._saved_s >= _SAVE_S:
+        if self._state is not None and now_s - self._saved_s >= _SAVE_S:
             self._saved_s = now_s
             self._save()
 
@@ -318,7 +311,7 @@ class Engine:
         return str(first[0]) if first else ""
 
     def _save(self) -> None:
-        path, last = self.settings.state, self.last
+        path, last = self._state, self.last
         if path is None or last is None:
             return
         T, C, resets = last.T_odom_body, last.pose_covariance, last.reset_counter

@@ -20,7 +20,7 @@ from gpvo.io.bag_reader import (
 )
 from gpvo.io.bags import has_word, info_topic
 from gpvo.live import POSE_TYPE_NAMES, WIRES, LiveSettings
-from gpvo.live.engine import Engine, EngineSettings, Output
+from gpvo.live.engine import Engine, Output
 from gpvo.live.intake import Arrival, Mailbox, arrivals, odometry_topic, replay
 from gpvo.live.late_truth import LateTruth
 from gpvo.live.outputs import FileOutput, MavlinkOutput, Px4Output, Wire, WireOutput, decode
@@ -88,8 +88,10 @@ class Live:
         predictor, outputs = Predictor.load(settings.model), _outputs(settings, wire)
         self._settings, self._wire, self._tell = settings, wire, tell
         self._topics = topics_in(stage, settings)
-        how = EngineSettings(settings.pose_covariance == "increment", settings.state, settings.vehicle)
-        self.engine = Engine(stage, predictor, outputs, how, tell, truth, self._topics)
+        self.engine = Engine(
+            stage, predictor, outputs, tell=tell, truth=truth, topics=self._topics,
+            increment=settings.pose_covariance == "increment", state=settings.state, vehicle=settings.vehicle,
+        )  # fmt: skip
         self._mailbox = Mailbox(settings.depth)
         self._ending, self._has_run = threading.Event(), False
         self._thread: threading.Thread | None = None

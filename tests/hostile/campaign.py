@@ -173,11 +173,11 @@ def read_stated_motions(path: Path) -> None:
 def read_live_state(path: Path) -> None:
     """A live session that goes on from it, with three poses of somebody's odometry."""
     from gpvo.geometry.covariance import is_positive_definite
-    from gpvo.live.engine import Engine, EngineSettings
+    from gpvo.live.engine import Engine
     from gpvo.live.intake import Arrival
     from gpvo.live.stages import PoseStage
 
-    live = Engine(PoseStage("/odom"), flying_model(), [], EngineSettings(state=path))
+    live = Engine(PoseStage("/odom"), flying_model(), [], state=path)
     for k in range(3):
         for said in live.take(Arrival("/odom", _pose_message(k), k * 10**8)):
             assert np.isfinite(said.T_odom_body).all(), "a pose that is none"

@@ -13,7 +13,7 @@ from gpvo.geometry import se3
 from gpvo.geometry.se3 import T_FLU_OPTICAL
 from gpvo.learning.config import TrainConfig
 from gpvo.learning.train import train_sets
-from gpvo.live.engine import Engine, EngineSettings, Health
+from gpvo.live.engine import Engine, Health
 from gpvo.live.intake import Arrival
 from gpvo.live.stages import PoseStage
 from gpvo.online import modelfile
@@ -84,8 +84,6 @@ class Kept:
         pass
 
 
-def engine(
-    settings: EngineSettings | None = None, predictor: Predictor | None = None
-) -> tuple[Engine, Kept, list[str]]:
+def engine(predictor: Predictor | None = None, **more: Any) -> tuple[Engine, Kept, list[str]]:
     kept, told = Kept(), []
-    return Engine(PoseStage(TOPIC), predictor or shim_predictor(), [kept], settings, told.append), kept, told
+    return Engine(PoseStage(TOPIC), predictor or shim_predictor(), [kept], tell=told.append, **more), kept, told

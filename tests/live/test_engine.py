@@ -26,7 +26,7 @@ from gpvo.io.bag_reader import messages as read
 from gpvo.io.foreign import read_foreign
 from gpvo.io.stated import to_records
 from gpvo.live import LiveSettings, job, outputs
-from gpvo.live.engine import Engine, EngineSettings
+from gpvo.live.engine import Engine
 from gpvo.live.intake import Arrival, replay
 from gpvo.live.job import run_live
 from gpvo.live.late_truth import LateTruth
@@ -230,7 +230,7 @@ def test_the_increments_covariance_neither_grows_nor_vanishes() -> None:
     stamps, T = flight()
     last = {}
     for increment in (False, True):
-        live, kept, _ = engine(EngineSettings(increment=increment))
+        live, kept, _ = engine(increment=increment)
         for arrival in flown(stamps, T):
             live.take(arrival)
         last[increment] = np.array([np.trace(o.pose_covariance[:3, :3]) for o in kept.frames[1:]])
@@ -242,7 +242,7 @@ def test_the_increments_covariance_neither_grows_nor_vanishes() -> None:
 
 def test_a_state_holds_what_adds_up_whichever_covariance_is_published(tmp_path: Path) -> None:
     for increment in (False, True):
-        live, _, _ = engine(EngineSettings(increment=increment, state=tmp_path / f"{increment}.json"))
+        live, _, _ = engine(increment=increment, state=tmp_path / f"{increment}.json")
         for arrival in flown(*flight()):
             live.take(arrival)
         live.close()
@@ -251,25 +251,25 @@ def test_a_state_holds_what_adds_up_whichever_covariance_is_published(tmp_path: 
 
 def test_a_state_is_taken_up_where_it_stopped(tmp_path: Path) -> None:
     stamps, T = flight(n=80)
-    settings = EngineSettings(state=tmp_path / "state.json")
+    state = tmp_path / "state.json"
     arrivals = flown(stamps, T)
-    before, kept_before, _ = engine(settings)
+    before, kept_before, _ = engine(state=state)
     for arrival in arrivals[:40]:
         before.take(arrival)
     before.close()
-    after, kept_after, _ = engine(settings)
+    after, kept_after, _ = engine(state=state)
     for arrival in arrivals[40:]:
         after.take(arrival)
     stopped, resumed = kept_before.frames[-1], kept_after.frames[0]
     np.testing.assert_allclose(resumed.T_odom_body, stopped.T_odom_body, atol=1e-9)
     assert np.linalg.eigvalsh(resumed.pose_covariance - stopped.pose_covariance).min() > 1e-3
     after.close()
-    again, kept_again, _ = engine(settings)
+    again, kept_again, _ = engine(state=state)
     again.take(arrivals[-1])
     assert [k.frames[0].reset_counter for k in (kept_before, kept_after, kept_again)] == [0, 1, 2]
     (tmp_path / "state.json").write_text("[]")
     with pytest.raises(GpvoError, match="not a state file of gpvo live"):
-        engine(settings)
+        engine(state=state)
 
 
 def _gone(way_m: float, n: int = 300) -> list[Arrival]:
@@ -280,12 +280,12 @@ def _gone(way_m: float, n: int = 300) -> list[Arrival]:
 
 
 def test_a_state_taken_up_under_way_is_as_unsure_as_what_was_missed_is_long(tmp_path: Path) -> None:
-    arrivals, settings = _gone(150.0), EngineSettings(state=tmp_path / "state.json")
-    before, _, _ = engine(settings)
+    arrivals, state = _gone(150.0), tmp_path / "state.json"
+    before, _, _ = engine(state=state)
     for arrival in arrivals[:100]:
         before.take(arrival)
     before.close()
-    after, kept, _ = engine(settings)
+    after, kept, _ = engine(state=state)
     after.take(arrivals[200])  # 5 s and 50 m later
     missed_m = 150.0 * 101 / 299
     assert missed_m / 3 < np.sqrt(kept.frames[0].pose_covariance[0, 0]) < 3 * missed_m
@@ -328,7 +328,7 @@ def test_a_state_that_cannot_be_is_refused_in_one_line(changed: dict, tmp_path: 
     good = {"schema": 1, "T_odom_body": np.eye(4), "pose_covariance": np.eye(6), "scale": np.ones(6)}
     write_json(tmp_path / "state.json", {**good, **changed})
     with pytest.raises(GpvoError, match=r"state\.json: is not a state file of gpvo live") as refusal:
-        engine(EngineSettings(state=tmp_path / "state.json"))
+        engine(state=tmp_path / "state.json")
     assert "\n" not in str(refusal.value)
 
 
@@ -537,8 +537,7 @@ def test_a_link_that_is_down_and_a_state_that_cannot_be_saved_end_nothing(tmp_pa
     folder, told, kept, closed = tmp_path / "gone", [], Kept(), []
     folder.mkdir()
     kept.close = lambda: closed.append(True)
-    settings = EngineSettings(state=folder / "state.json")
-    live = Engine(PoseStage(TOPIC), shim_predictor(), [_Down(), kept], settings, tell=told.append)
+    live = Engine(PoseStage(TOPIC), shim_predictor(), [_Down(), kept], tell=told.append, state=folder / "state.json")
     for k, arrival in enumerate(flown(stamps, T)):
         if k == 1:
             shutil.rmtree(folder)
@@ -553,7 +552,7 @@ def test_a_link_that_is_down_and_a_state_that_cannot_be_saved_end_nothing(tmp_pa
         live.close()
     assert closed
     with pytest.raises(GpvoError, match="is no folder"):
-        engine(settings)
+        engine(state=folder / "state.json")
 
 
 def _with_truth(
@@ -576,7 +575,7 @@ def _with_truth(
     arrivals = sorted([*flown(stamps, np.array(T_est)), *late], key=lambda a: a.received_ns)
     stage = PoseStage(TOPIC)
     tell, truth = ([] if told is None else told).append, LateTruth("/mocap")
-    return Engine(stage, shim_predictor(), [Kept()], EngineSettings(state=state), tell, truth), arrivals
+    return Engine(stage, shim_predictor(), [Kept()], tell=tell, truth=truth, state=state), arrivals
 
 
 def test_late_truth_adapts_the_scale_which_a_restart_keeps(tmp_path: Path) -> None:
