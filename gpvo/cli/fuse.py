@@ -48,22 +48,15 @@ def fuse(
     refuse_twice(runs)
     refuse_folder(log)
     judging = twin_options.asked(ctx, twins, seed, "seed")
-    one_of("--init", init, ("truth", "static"))
-    one_of("--gate", gate, ("discard", "inflate"))
+    options = FuseOptions(
+        init=one_of("--init", init, ("truth", "static")),
+        gate=Gate(on_fail=one_of("--gate", gate, ("discard", "inflate"))),
+    )
     if plot is not None:
         from gpvo.evaluation import plots
 
         plots.require_picture(plot)  # before the work, not after it
     wanted = tuple(p.strip() for p in policies.split(",") if p.strip())
-    settings = FusionSettings(
-        policies=wanted,
-        model=model,
-        use_imu=not no_imu,
-        options=FuseOptions(
-            init="static" if init == "static" else "truth",
-            gate=Gate(on_fail="inflate" if gate == "inflate" else "discard"),
-        ),
-    )
     teaching = replace(judging, seed=0) if judging else None
     with (
         in_place_of_runs_without_truth(runs, judging) as flown,
@@ -72,7 +65,7 @@ def fuse(
     ):
         report = fuse_runs(
             flown,
-            replace(settings, training=tuple(taught)),
+            FusionSettings(wanted, model, tuple(taught), use_imu=not no_imu, options=options),
             tell=tell,
             on_run=lambda fused: write_log(log / f"{fused.name}_{fused.policy}.csv", fused) if log else None,
         )

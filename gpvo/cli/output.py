@@ -10,7 +10,7 @@ import textwrap
 import time
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import contextmanager
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any, TypeVar
 
 from gpvo.errors import GpvoError
 from gpvo.files import plain
@@ -18,6 +18,7 @@ from gpvo.files import plain
 if TYPE_CHECKING:
     from rich.console import Console
 
+T = TypeVar("T", bound=str)
 Json = Annotated[bool, "Print the result as JSON."]
 _MOST = 1e10  # of any number on a command line: metres, seconds
 _loud = {"quiet": False, "verbose": False}
@@ -89,13 +90,13 @@ def answer(as_json: bool, document: dict[str, Any], told: Callable[[], object]) 
     print_json(document) if as_json else told()
 
 
-def one_of(option: str, value: str, choices: Iterable[str]) -> str:
-    """The value of an option. Raises GpvoError if it is not one of the choices."""
+def one_of(option: str, value: str, choices: Iterable[T]) -> T:
+    """The value of an option, as one of the choices. Raises GpvoError if it is none of them."""
     known = list(choices)
-    if value not in known:
+    if (chosen := next((choice for choice in known if choice == value), None)) is None:
         cure = f"choose {known[0]} or {known[1]}" if len(known) == 2 else f"choose one of: {', '.join(known)}"
         raise GpvoError(f"{option} is '{value}'", cure=cure)
-    return value
+    return chosen
 
 
 def numbers(option: str, text: str, cure: str, *, counts: Sequence[int] = (), least: float = -math.inf) -> list[float]:
