@@ -33,11 +33,6 @@ class Step:
     covariance: Array
 
 
-def outcome_of(outcome: str, passed: bool) -> str:
-    """Of a member that did or did not pass the gate, where the ``outcome`` is that of all members together."""
-    return ("used" if passed else "rejected") if outcome in ("used", "rejected") else outcome
-
-
 @dataclass
 class Rival:
     """A timeline that takes a clock to have been set ahead by ``set_ns``; its steps since; and by how much the motions

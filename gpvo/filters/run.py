@@ -16,7 +16,7 @@ from gpvo.filters.measurement import Gate
 from gpvo.filters.plausible import saturated, usable
 from gpvo.filters.policies import Policy
 from gpvo.filters.propagation import DEFAULT_IMU_NOISE, TH, P, constant_velocity_noise, each
-from gpvo.filters.rivals import Step, outcome_of
+from gpvo.filters.rivals import Step
 from gpvo.filters.start import Start, StartSigmas, from_rest, from_truth, tilt_of, vertical_in_world
 from gpvo.filters.timeline import Timeline
 from gpvo.geometry import se3
@@ -205,46 +205,55 @@ def make_filter(
 
 @dataclass(frozen=True)
 class _Kept:
-    """What is kept of the steps at N records of B members: all of them would take 20 kB a record."""
+    """What is kept of the steps at N records: all of them would take 20 kB a record."""
 
-    pose: Array  # (N, B, 3, 4)
-    upper: Array  # (N, B, 45)
-    innovation: Array  # (N, B, 13): residual, its standard deviation, NIS
+    pose: Array  # (N, 3, 4)
+    upper: Array  # (N, 45)
+    innovation: Array  # (N, 13): residual, its standard deviation, NIS
     outcomes: list[str]
-    passed: NDArray[np.bool_]  # (N, B)
 
     @classmethod
-    def empty(cls, n: int, batch: int) -> _Kept:
+    def empty(cls, n: int) -> _Kept:
         """Before the first step."""
-        innovation = np.full((n, batch, 13), np.nan)
-        return cls(
-            np.empty((n, batch, 3, 4)), np.empty((n, batch, 45)), innovation, [""] * n, np.ones((n, batch), bool)
-        )
+        return cls(np.empty((n, 3, 4)), np.empty((n, 45)), np.full((n, 13), np.nan), [""] * n)
 
     def take(self, k: int, step: Step) -> None:
         """The step of record k; a later one, of the same record put in its place again, replaces it."""
-        self.pose[k, :, :, :3], self.pose[k, :, :, 3] = step.nominal.R_world_imu, step.nominal.position
-        self.upper[k] = upper(step.covariance[:, : TH.stop, : TH.stop])
-        self.upper[k, ~np.isfinite(step.covariance).all(axis=(1, 2))] = np.nan
-        self.outcomes[k], self.innovation[k], self.passed[k] = step.outcome, np.nan, True
+        self.pose[k, :, :3], self.pose[k, :, 3] = step.nominal.R_world_imu[0], step.nominal.position[0]
+        covariance = step.covariance[0]
+        self.upper[k] = upper(covariance[: TH.stop, : TH.stop]) if np.isfinite(covariance).all() else np.nan
+        self.outcomes[k], self.innovation[k] = step.outcome, np.nan
         if (found := step.innovation) is not None:
-            self.innovation[k, :, :6] = found.residual
-            self.innovation[k, :, 6:12] = np.sqrt(np.diagonal(found.S, axis1=1, axis2=2))
-            self.innovation[k, :, 12], self.passed[k] = found.nis, found.passed
+            self.innovation[k] = [*found.residual[0], *np.sqrt(np.diagonal(found.S[0])), found.nis[0]]
 
 
 def fuse_flight(
-    flight: Flight,
-    policy: Policy,
-    options: FuseOptions | None = None,
-    *,
-    batch: int = 1,
-    progress: Progress = no_progress,
-) -> list[FusedRun]:
-    """Filter one run under one policy; one result per member (a policy may set several noises side by side)."""
-    kept = _Kept.empty(len(flight.records), batch)
-    timeline, start, rows = _fly(flight, policy, options or FuseOptions(), batch, kept.take, progress)
-    return [_member(flight, policy.name, b, kept, rows, timeline, start) for b in range(batch)]
+    flight: Flight, policy: Policy, options: FuseOptions | None = None, *, progress: Progress = no_progress
+) -> FusedRun:
+    """Filter one run under one policy of a single noise."""
+    kept = _Kept.empty(len(flight.records))
+    timeline, start, rows = _fly(flight, policy, options or FuseOptions(), 1, kept.take, progress)
+    # Views, where all records made a step in their order, as nearly always.
+    of = slice(None) if np.array_equal(rows, np.arange(len(flight.records))) else rows
+    pose, innovation, outcomes = kept.pose[of], kept.innovation[of], [kept.outcomes[k] for k in rows.tolist()]
+    nis, failed = innovation[:, 12], outcomes.count("rejected")
+    run = FusedRun(
+        name=flight.name,
+        policy=policy.name,
+        t_ns=VoLog(flight.records).t_ns[rows],
+        R_world_imu=pose[:, :, :3],
+        position=pose[:, :, 3],
+        covariance_upper=kept.upper[of],
+        T_imu_cam=np.eye(4) if flight.T_imu_cam is None else flight.T_imu_cam,
+        outcomes=outcomes,
+        residual=innovation[:, :6],
+        residual_sigma=innovation[:, 6:12],
+        nis=nis,
+        counts={**timeline.counts, "rejected": failed},
+        scores=metrics.without_truth(nis, failed),
+        note=start.note,
+    )
+    return replace(run, scores=_score(flight, run, rows, start.world_tilt)) if flight.has_truth else run
 
 
 def ate_of_members(
@@ -301,33 +310,6 @@ def _fly(
             done[step.t_ns] = index[step.t_ns]
             keep(done[step.t_ns], step)
     return timeline, start, np.array([done[t] for t in sorted(done)], dtype=np.int64)
-
-
-def _member(
-    flight: Flight, policy: str, b: int, kept: _Kept, rows: NDArray[np.int64], timeline: Timeline, start: Start
-) -> FusedRun:
-    # Views, where all records made a step in their order, as nearly always.
-    of = slice(None) if np.array_equal(rows, np.arange(len(flight.records))) else rows
-    pose, innovation, passed = kept.pose[:, b][of], kept.innovation[:, b][of], kept.passed[rows, b]
-    outcomes = [kept.outcomes[k] for k in rows.tolist()]
-    nis, failed = innovation[:, 12], int((~passed).sum())
-    run = FusedRun(
-        name=flight.name,
-        policy=policy,
-        t_ns=VoLog(flight.records).t_ns[rows],
-        R_world_imu=pose[:, :, :3],
-        position=pose[:, :, 3],
-        covariance_upper=kept.upper[:, b][of],
-        T_imu_cam=np.eye(4) if flight.T_imu_cam is None else flight.T_imu_cam,
-        outcomes=[outcome_of(o, p) for o, p in zip(outcomes, passed.tolist(), strict=True)],
-        residual=innovation[:, :6],
-        residual_sigma=innovation[:, 6:12],
-        nis=nis,
-        counts={**timeline.counts, "rejected": failed},
-        scores=metrics.without_truth(nis, failed),
-        note=start.note,
-    )
-    return replace(run, scores=_score(flight, run, rows, start.world_tilt)) if flight.has_truth else run
 
 
 def _score(flight: Flight, run: FusedRun, rows: NDArray[np.int64], world_tilt: Array) -> metrics.Scores:

@@ -1,17 +1,13 @@
-"""All policies over many runs: the scalars of the tuned constants, paired differences with intervals, every run.
-
-Those of one run fly side by side, as members of one filter: they cost little more than one alone.
-"""
+"""All policies over many runs: the scalars of the tuned constants, paired differences with intervals, every run."""
 
 from __future__ import annotations
 
 import textwrap
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 
 import numpy as np
 
-from gpvo.accumulation import stacked
 from gpvo.errors import GpvoError
 from gpvo.filters.metrics import Scores
 from gpvo.filters.policies import (
@@ -27,7 +23,7 @@ from gpvo.filters.policies import (
 )
 from gpvo.filters.run import Flight, FusedRun, FuseOptions, Progress, ate_of_members, fuse_flight, no_progress
 from gpvo.stats.series import Interval, sequence_bootstrap
-from gpvo.types import Array, MotionError, Prediction, VoLog, VoRecord
+from gpvo.types import Array, VoLog
 
 # Variance factors tried for (translation, rotation): first these powers of four, then between the neighbours.
 _COARSE: Array = np.power(4.0, np.arange(-6, 2))
@@ -160,15 +156,25 @@ def study(
     progress: Progress = no_progress,
     on_run: Callable[[Flight, FusedRun], None] | None = None,
 ) -> Study:
-    """Filter every run under every policy; ``on_run`` sees each filtered run before it is reduced to scores."""
+    """Filter every run under every policy, one after another, that speaks for at least half of its measured motions;
+    ``on_run`` sees each filtered run before it is reduced to scores."""
     scores: dict[str, list[Scores | None]] = {name: [] for name in policies}
     for flight in flights:
-        fused = fuse_side_by_side(flight, {name: p for name, p in policies.items() if p is not None}, options, progress)
-        for name in policies:
-            scores[name].append(fused[name].scores if name in fused else None)
-            if on_run and name in fused:
-                on_run(flight, fused[name])
+        for name, policy in policies.items():
+            if policy is None or not _speaks(policy, flight):
+                scores[name].append(None)
+                continue
+            fused = fuse_flight(flight, policy, options, progress=progress)
+            scores[name].append(fused.scores)
+            if on_run:
+                on_run(flight, fused)
     return Study(tuple(f.name for f in flights), {k: tuple(v) for k, v in scores.items()}, constants)
+
+
+def _speaks(policy: Policy, flight: Flight) -> bool:
+    """Whether a policy states the noise of at least half of the motions that were measured, and of any."""
+    said = (policy.noise(r, flight.predictions.get(r.t_ns)) is not None for r in flight.records if r.usable)
+    return 2 * sum(said) >= max(int(VoLog(flight.records).usable.sum()), 1)
 
 
 def table(study: Study) -> str:
@@ -210,76 +216,3 @@ def _cell(value: float, digits: int, width: int) -> str:
         digits -= 1
     text = f"{value:.{digits}f}"
     return f"{text if len(text) < width else f'{value:.0e}':>{width}}"
-
-
-@dataclass(frozen=True)
-class _SideBySide:
-    """The noises of several policies, one member each, all of which speak of the same records."""
-
-    policies: Sequence[Policy]
-    name: str = "side by side"
-
-    def noise(self, record: VoRecord, prediction: Prediction | None) -> MotionError | None:
-        found = [noise.row(0) for p in self.policies if (noise := p.noise(record, prediction)) is not None]
-        return stacked(found) if found else None
-
-
-def fuse_side_by_side(
-    flight: Flight,
-    policies: Mapping[str, Policy],
-    options: FuseOptions | None = None,
-    progress: Progress = no_progress,
-) -> dict[str, FusedRun]:
-    """Filter one run under each policy (of one member) that speaks for at least half of its measured motions; results
-    as if each had filtered alone.
-
-    Members see the same clock and the same records; that it was set, the motions of all must say. A policy that has
-    nothing to say about some records, or whose bias has other time constants, is filtered by itself.
-    """
-    usable = int(VoLog(flight.records).usable.sum())
-    stated = {name: s for name, s in _stated(flight, policies).items() if usable and 2 * len(s.t_ns) >= usable}
-    together = _alike(stated)
-    out: dict[str, FusedRun] = {}
-    if len(together) > 1:
-        side_by_side = _SideBySide([policies[name] for name in together])
-        fused = fuse_flight(flight, side_by_side, options, batch=len(together), progress=progress)
-        out = {name: replace(run, policy=name) for name, run in zip(together, fused, strict=True)}
-    for name in stated:
-        if name not in out:
-            out[name] = fuse_flight(flight, policies[name], options, progress=progress)[0]
-    return out
-
-
-@dataclass(frozen=True)
-class _Stated:
-    """Of which records a policy speaks, which of them it takes for lost, and the time constants of what persists."""
-
-    t_ns: set[int] = field(default_factory=set)
-    lost: set[int] = field(default_factory=set)
-    tau_s: set[bytes] = field(default_factory=set)
-
-
-def _stated(flight: Flight, policies: Mapping[str, Policy]) -> dict[str, _Stated]:
-    out = {name: _Stated() for name in policies}
-    for record in flight.records:
-        for name, policy in policies.items() if record.usable else ():
-            noise = policy.noise(record, flight.predictions.get(record.t_ns))
-            if noise is not None:
-                out[name].t_ns.add(record.t_ns)
-                out[name].lost.update([record.t_ns] if noise.lost else ())
-                out[name].tau_s.update([noise.persistent_tau_s.tobytes()] if len(noise.persistent_tau_s) else ())
-    return out
-
-
-def _alike(stated: Mapping[str, _Stated]) -> list[str]:
-    """Policies that speak for all records that any speaks for, with one set of time constants and of lost motions."""
-    everything = set[int]().union(*(s.t_ns for s in stated.values()))
-    shared: set[tuple[bytes, frozenset[int]]] = set()
-    names = []
-    for name, s in stated.items():
-        # What a lost motion does not share is nothing to members whose motions share nothing.
-        own = {(tau_s, frozenset(s.lost)) for tau_s in s.tau_s}
-        if s.t_ns == everything and len(own | shared) <= 1:
-            shared |= own
-            names.append(name)
-    return names

@@ -21,7 +21,7 @@ from gpvo.filters.eskf import ErrorStateFilter
 from gpvo.filters.measurement import Gate, Innovation, Wait
 from gpvo.filters.plausible import GAP_S, LONGEST_GAP_S, ImuGuard, Samples
 from gpvo.filters.policies import Policy
-from gpvo.filters.rivals import RARELY_SET, Rival, Step, outcome_of
+from gpvo.filters.rivals import RARELY_SET, Rival, Step
 from gpvo.online.observer import LONGEST_STEP_S, follows
 from gpvo.stats.series import Doubt
 from gpvo.types import Array, MotionError, Prediction, Status, VoRecord
@@ -297,7 +297,7 @@ class Timeline:
                 self.filter, innovation = unmoved, other
                 self.counts["clock_set_ahead"] += 1
         self.counts["recovered"] += int((recover & ~innovation.passed).any())
-        return outcome_of("used", bool(innovation.passed.all())), innovation
+        return "used" if innovation.passed.all() else "rejected", innovation
 
     def _remember(self, t_ns: int, record: VoRecord, noise: MotionError | None) -> None:
         if self._history_ns <= 0:

@@ -40,7 +40,7 @@ def _from_rest(rest_s: float, move_s: float, swing: float = 1.0) -> Flight:
 
 
 def test_a_vehicle_that_rested_long_is_followed_when_it_sets_off() -> None:
-    run = fuse_flight(_from_rest(50.0, 10.0), GeometricPolicy("triangulation"))[0]
+    run = fuse_flight(_from_rest(50.0, 10.0), GeometricPolicy("triangulation"))
     assert run.scores.rejected == 0
     assert run.scores.final_error_m < 0.1
     assert run.scores.nees_position < 3.0
@@ -50,7 +50,7 @@ def test_a_vehicle_that_rested_long_is_followed_when_it_sets_off() -> None:
 @pytest.mark.parametrize("move_s", [8.0, 20.0, 60.0])
 def test_an_acceleration_that_lasts_is_followed_though_cruising_is_smooth(rest_s: float, move_s: float) -> None:
     """In each frame it is small, and most have none: 21 motions of setting off were rejected, at a NEES of 300."""
-    run = fuse_flight(_from_rest(rest_s, move_s, swing=0.1), GeometricPolicy("triangulation"))[0]
+    run = fuse_flight(_from_rest(rest_s, move_s, swing=0.1), GeometricPolicy("triangulation"))
     assert run.scores.rejected == 0
     assert run.scores.nees_position < 3.0
 

@@ -11,7 +11,7 @@ from gpvo.errors import GpvoError
 from gpvo.filters import metrics
 from gpvo.filters.policies import ConstantPolicy, GeometricPolicy, LearnedPolicy
 from gpvo.filters.run import FuseOptions, fuse_flight
-from gpvo.filters.study import Constants, Study, fit_scalars, fuse_side_by_side, make_policies, study, table
+from gpvo.filters.study import Constants, Study, fit_scalars, make_policies, study, table
 from gpvo.geometry import se3
 from gpvo.types import Status, VoRecord
 from synthetic_flights import FORWARD_CAMERA, ErrorLaw, synthetic_flight, with_geometric
@@ -53,7 +53,7 @@ def test_constants_are_tuned_on_flights_with_truth() -> None:
 
 def test_scores_are_of_the_camera_at_the_end_and_count_the_noise_of_truth_in() -> None:
     flight, rng, sigma = synthetic_flight(3, duration_s=4), np.random.default_rng(0), (0.1, 0.02)
-    (run,) = fuse_flight(flight, LearnedPolicy())
+    run = fuse_flight(flight, LearnedPolicy())
     assert flight.T_world_cam is not None
     np.testing.assert_allclose(run.T_world_cam, run.T_world_imu @ FORWARD_CAMERA, atol=1e-12)
     truth = flight.T_world_cam[:, :3, 3]
@@ -64,7 +64,7 @@ def test_scores_are_of_the_camera_at_the_end_and_count_the_noise_of_truth_in() -
     noisy = flight.T_world_cam.copy()  # but for the poses of the start
     noisy[5:, :3, 3] += sigma[0] * rng.standard_normal((len(noisy) - 5, 3))
     noisy[5:, :3, :3] = noisy[5:, :3, :3] @ se3.so3_exp(sigma[1] * rng.standard_normal((len(noisy) - 5, 3)))
-    scores = fuse_flight(replace(flight, T_world_cam=noisy, truth_sigma=sigma), LearnedPolicy())[0].scores
+    scores = fuse_flight(replace(flight, T_world_cam=noisy, truth_sigma=sigma), LearnedPolicy()).scores
     # The mean of 76 times three squares scatters by 9 %: four of that, as the filter knows its place far better.
     for found in (scores.nees_position, scores.nees_attitude):
         assert found == pytest.approx(1.0, abs=0.4)
@@ -117,29 +117,23 @@ def test_study_tells_a_better_policy_and_leaves_out_what_cannot_run() -> None:
     assert all(f.name in text for f in flights)
     assert "nan" not in text
     assert all(len(line) <= 80 for line in text.splitlines() if not line.startswith("ATE m on"))
-    given = {"triangulation": GeometricPolicy("triangulation"), "learned": LearnedPolicy()}
-    assert list(fuse_side_by_side(flights[0], given)) == ["learned"]
-    assert set(fuse_side_by_side(with_geometric(flights[0], np.eye(6)), given)) == set(given)
 
 
-def test_policies_side_by_side_are_as_each_alone() -> None:
-    flight = with_geometric(synthetic_flight(3, duration_s=6, law=ErrorLaw(burst_factor=10.0)), 1e-4 * np.eye(6))
-    some = [replace(r, covariances={}) if i == 9 else r for i, r in enumerate(flight.records)]
-    flight = replace(flight, records=some)  # one record of which the geometry says nothing
-    constant = ConstantPolicy(np.full(6, 1e-5), 0.05)
-    policies = {"learned": LearnedPolicy(), "constant": constant, "triangulation": GeometricPolicy("triangulation")}
-    together = fuse_side_by_side(flight, policies, FuseOptions())
-    for name, policy in policies.items():
-        alone = fuse_flight(flight, policy, FuseOptions())[0]
-        assert together[name].policy == name
-        np.testing.assert_allclose(together[name].T_world_cam, alone.T_world_cam, atol=1e-9)
-        np.testing.assert_allclose(together[name].covariance, alone.covariance, rtol=1e-6, atol=1e-15)
-        assert together[name].outcomes == alone.outcomes
+@pytest.mark.parametrize("share, flown", [(0.4, ["learned", "triangulation"]), (0.6, ["learned"])])
+def test_a_policy_is_left_out_that_is_silent_on_more_than_half_of_the_motions(share: float, flown: list[str]) -> None:
+    flight = with_geometric(synthetic_flight(3, duration_s=4), 1e-4 * np.eye(6))
+    silent = int(share * len(flight.records))
+    records = [replace(r, covariances={}) if i < silent else r for i, r in enumerate(flight.records)]
+    policies = {"learned": LearnedPolicy(), "triangulation": GeometricPolicy("triangulation")}
+    seen: list[str] = []
+    result = study([replace(flight, records=records)], policies, on_run=lambda _, fused: seen.append(fused.policy))
+    assert seen == flown
+    assert (result.scores["triangulation"] == (None,)) == ("triangulation" not in flown)
 
 
 def test_a_run_without_truth_has_not_said_that_it_held() -> None:
     """One run diverged, one did not, of one no truth tells, and in one the policy could not run."""
-    told = fuse_flight(synthetic_flight(0, duration_s=4), ConstantPolicy(np.full(6, 1e-5), 0.05))[0].scores
+    told = fuse_flight(synthetic_flight(0, duration_s=4), ConstantPolicy(np.full(6, 1e-5), 0.05)).scores
     runs = [replace(told, diverged=d) for d in (True, False, None)]
     of_all = Study(("a", "b", "c", "d"), {"constant": (*runs, None), "learned": (runs[2], None, None, None)})
     np.testing.assert_array_equal(of_all.column("constant", "diverged"), [1.0, 0.0, np.nan, np.nan])
@@ -148,24 +142,24 @@ def test_a_run_without_truth_has_not_said_that_it_held() -> None:
 
 
 def test_columns_hold_numbers_of_any_size() -> None:
-    told = fuse_flight(synthetic_flight(0, duration_s=2), ConstantPolicy(np.full(6, 1e-5), 0.05))[0].scores
+    told = fuse_flight(synthetic_flight(0, duration_s=2), ConstantPolicy(np.full(6, 1e-5), 0.05)).scores
     gone = replace(told, ate_rmse_m=8.5e9, final_error_m=7.4e21, nees_position=6e8, nis_dof=123456.0)
     row = table(Study(("a",), {"constant": (gone,)})).splitlines()[1]
     assert len(row) <= 80
     assert [float(v) for v in row.split()[1:3]] == [pytest.approx(8.5e9, rel=0.1), pytest.approx(7.4e21, rel=0.1)]
 
 
-def test_a_record_costs_two_kilobytes_for_each_policy() -> None:
-    """Of a day's flight the filter's own states would fill the memory: each is twenty times as large."""
+def test_a_record_costs_two_kilobytes_in_each_run() -> None:
+    """Of a day's flight the filter's own states would fill the memory: each is ten times as large."""
     C = 1e-4 * np.eye(6)
     flights = [replace(with_geometric(synthetic_flight(3, duration_s=s), C), imu=None, T_imu_cam=None) for s in (5, 25)]
-    policies = {str(k): ConstantPolicy(np.full(6, 1e-5), 0.05, name=str(k)) for k in range(6)}
-    fuse_side_by_side(flights[0], policies)  # caches are filled
+    policies = [ConstantPolicy(np.full(6, 1e-5), 0.05, name=str(k)) for k in range(6)]
+    fuse_flight(flights[0], policies[0])  # caches are filled
     peak = []
     for flight in flights:
         tracemalloc.start()
-        fuse_side_by_side(flight, policies)
+        kept = [fuse_flight(flight, policy) for policy in policies]
         peak.append(tracemalloc.get_traced_memory()[1])
         tracemalloc.stop()
     more = len(flights[1].records) - len(flights[0].records)
-    assert (peak[1] - peak[0]) / more < 2000 * len(policies)
+    assert (peak[1] - peak[0]) / more < 2000 * len(kept)

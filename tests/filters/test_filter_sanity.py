@@ -235,7 +235,7 @@ def test_frames_beyond_the_imu_are_left_out_and_a_bad_sample_spoils_nothing(flig
     half = ImuLog(flight.imu.t_ns[:2000], flight.imu.gyro_radps[:2000], acc[:2000], flight.imu.noise)
     short = replace(flight, imu=half)
     assert "left out" in str([str(f) for f in check_flight(short)])
-    run = fuse_flight(short, LearnedPolicy())[0]
+    run = fuse_flight(short, LearnedPolicy())
     assert run.t_ns[-1] <= half.t_ns[-1] + 100_000_000
     assert run.scores is not None
     assert run.scores.ate_rmse_m < 0.1

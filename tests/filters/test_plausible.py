@@ -48,7 +48,7 @@ def test_a_sensor_at_the_end_of_its_range_says_nothing(monkeypatch: pytest.Monke
     monkeypatch.setattr(plausible, "_LEAST_RANGE", (0.5, 15.0))  # the flight turns by no more
     flight = clipped(synthetic_flight(2, duration_s=15), 0.6)
     assert [f.kind for f in check_flight(flight)] == ["saturated"]
-    scores = fuse_flight(flight, LearnedPolicy())[0].scores
+    scores = fuse_flight(flight, LearnedPolicy()).scores
     assert scores is not None
     assert (scores.nees_position or 99.0) < 2.0
     assert (scores.nees_attitude or 99.0) < 2.0

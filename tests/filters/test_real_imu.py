@@ -63,7 +63,7 @@ def test_vertical_of_the_truth(flight: Flight) -> None:
 
 
 def test_the_filter_follows(flight: Flight) -> None:
-    run = fuse_flight(flight, LearnedPolicy())[0]
+    run = fuse_flight(flight, LearnedPolicy())
     assert run.scores is not None
     assert not run.scores.diverged
     assert run.scores.final_error_m < 1.5

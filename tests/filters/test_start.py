@@ -132,7 +132,7 @@ def test_a_world_whose_z_is_not_up() -> None:
     assert gravity is not None
     np.testing.assert_allclose(gravity, tilted[:3, :3] @ [0, 0, -9.80665], atol=0.2)
     assert "gravity measured" in start.note
-    run = fuse_flight(turned, LearnedPolicy())[0]
+    run = fuse_flight(turned, LearnedPolicy())
     assert run.scores is not None
     assert run.scores.final_error_m < 1.0
 
@@ -190,7 +190,7 @@ def test_a_truth_that_is_not_level_is_judged_as_one_that_is(tilt_deg: float) -> 
         flight = synthetic_flight(seed, duration_s=15, turn_on=(0.05, 5e-3))  # as the filter expects
         assert flight.T_world_cam is not None
         turned = replace(flight, T_world_cam=tilted @ flight.T_world_cam)
-        scores.append(fuse_flight(turned, LearnedPolicy())[0].scores)
+        scores.append(fuse_flight(turned, LearnedPolicy()).scores)
     # Errors of eight flights of 15 s: the position's have some ten independent ones. At first, the tilt counts twice:
     # in the filter's covariance, and in how far the truth's vertical may be from its own.
     assert 0.3 < np.mean([s.nees_position for s in scores]) < 2.0
@@ -247,7 +247,7 @@ def test_a_tiny_rig_is_filtered_as_any_other(tmp_path: Path) -> None:
         write_run(tmp_path / f"{scale:g}", log, truth=truth)
         options = FuseOptions(sigmas=start_sigmas([read_run(tmp_path / f"{scale:g}")]))
         tiny = replace(flight, records=records, T_world_cam=truth.T_world_cam, predictions={})
-        scores.append(fuse_flight(tiny, GeometricPolicy("triangulation"), options)[0].scores)
+        scores.append(fuse_flight(tiny, GeometricPolicy("triangulation"), options).scores)
     assert scores[1].ate_rmse_m == pytest.approx(1e-3 * scores[0].ate_rmse_m, rel=0.01)
     for block, nees in scores[0].nees_dof.items():
         assert scores[1].nees_dof[block] == pytest.approx(nees, rel=0.02)

@@ -84,7 +84,7 @@ def test_records_out_of_order_are_scored_as_those_in_order(flight: Flight) -> No
     records = list(flight.records)
     for i in range(20, len(records) - 2, 9):
         records[i], records[i + 1] = records[i + 1], records[i]
-    given, swapped = (fuse_flight(f, LearnedPolicy())[0] for f in (flight, replace(flight, records=records)))
+    given, swapped = (fuse_flight(f, LearnedPolicy()) for f in (flight, replace(flight, records=records)))
     assert swapped.counts["reordered"] > 5
     np.testing.assert_allclose(swapped.T_world_imu, given.T_world_imu, atol=1e-9)
     np.testing.assert_allclose(swapped.covariance, given.covariance, atol=1e-12)
@@ -160,8 +160,8 @@ def test_a_gap_in_the_imu_widens_the_state(flight: Flight) -> None:
     keep[500:600] = False
     imu = flight.imu
     gappy = ImuLog(imu.t_ns[keep], imu.gyro_radps[keep], imu.acc_mps2[keep], imu.noise)
-    whole = fuse_flight(flight, LearnedPolicy())[0]
-    broken = fuse_flight(replace(flight, imu=gappy), LearnedPolicy())[0]
+    whole = fuse_flight(flight, LearnedPolicy())
+    broken = fuse_flight(replace(flight, imu=gappy), LearnedPolicy())
     assert broken.counts["imu_gaps"] > 0
     assert broken.scores is not None
     assert not broken.scores.diverged
@@ -188,7 +188,7 @@ def test_a_silence_of_camera_and_imu_is_as_uncertain_as_it_is(silence_s: float, 
             T_world_cam=flight.T_world_cam[seen],
             truth_valid=np.ones(seen.sum(), bool),
         )
-        run = fuse_flight(flight, LearnedPolicy())[0]
+        run = fuse_flight(flight, LearnedPolicy())
         k = int(np.searchsorted(run.t_ns, last))
         truth, C = flight.T_world_imu, run.covariance
         p = metrics.position_nees(run.T_world_imu[:, :3, 3], truth[:, :3, 3], C[:, :3, :3])
@@ -392,7 +392,7 @@ def test_the_jitter_of_a_slow_imus_stamps_is_no_gap() -> None:
     t_ns[1:-1:7] += 42_000_000
     steps = np.diff(t_ns)
     assert steps.min() == 8_000_000
-    run = fuse_flight(replace(flight, imu=replace(flight.imu, t_ns=t_ns)), LearnedPolicy())[0]
+    run = fuse_flight(replace(flight, imu=replace(flight.imu, t_ns=t_ns)), LearnedPolicy())
     assert "imu_gaps" not in run.counts
 
 
@@ -400,7 +400,7 @@ def test_darkness_frozen_frames_and_bursts_do_not_diverge() -> None:
     law = ErrorLaw(burst_factor=15.0)
     for seed in range(3):
         flight = synthetic_flight(seed, duration_s=12, law=law, events=Events(dark=(3.0, 5.0), frozen=(7.0, 8.0)))
-        run = fuse_flight(flight, LearnedPolicy())[0]
+        run = fuse_flight(flight, LearnedPolicy())
         assert run.counts["lost"] == 40
         assert run.counts.get("no_reference", 0) == 0
         assert run.scores is not None
@@ -556,7 +556,7 @@ def test_standing_still_against_one_reference_does_not_grow(flight: Flight) -> N
         predictions[t] = prediction(t, zero, template.covariance, zero)
     poses = np.tile(FORWARD_CAMERA, (len(records), 1, 1))
     still = Flight("still", records, ImuLog(t_ns, gyro, acc, MEMS), FORWARD_CAMERA, poses, None, predictions)
-    run = fuse_flight(still, LearnedPolicy())[0]
+    run = fuse_flight(still, LearnedPolicy())
     sigma = np.sqrt(np.trace(run.covariance[:, :3, :3], axis1=1, axis2=2))
     assert sigma[-1] < 1.5 * sigma[50]
     assert np.linalg.norm(run.T_world_imu[-1, :3, 3]) < 0.01

@@ -88,7 +88,7 @@ def fused(flight: Flight) -> FusedRun:
     # The flights' own law of the biases at the start.
     return fuse_flight(
         flight, LearnedPolicy(), FuseOptions(sigmas=StartSigmas(acc_bias_mps2=0.03, gyro_bias_radps=2e-3))
-    )[0]
+    )
 
 
 @cache
@@ -164,5 +164,5 @@ def test_a_flight_that_goes_nowhere_has_no_drift_per_distance() -> None:
     still = np.tile(flight.T_world_cam[0], (len(flight.T_world_cam), 1, 1))
     still[:, 0, 3] += 1e-15 * np.arange(len(still))
     assert np.isnan(
-        fuse_flight(replace(flight, T_world_cam=still), LearnedPolicy(), FuseOptions())[0].scores.drift_percent
+        fuse_flight(replace(flight, T_world_cam=still), LearnedPolicy(), FuseOptions()).scores.drift_percent
     )

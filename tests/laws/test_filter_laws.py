@@ -12,7 +12,7 @@ from gpvo.filters.eskf import ErrorStateFilter
 from gpvo.filters.measurement import Gate
 from gpvo.filters.policies import ConstantPolicy
 from gpvo.filters.propagation import BA, BG, CORE, TH, Nominal, P, V, imu_step
-from gpvo.filters.run import Flight, FuseOptions, fuse_flight
+from gpvo.filters.run import Flight, FuseOptions, ate_of_members, fuse_flight
 from gpvo.filters.start import StartSigmas
 from gpvo.filters.study import Constants, grid_scores
 from gpvo.filters.timeline import Timeline
@@ -288,16 +288,18 @@ def test_nees_is_one_in_the_linear_regime(batch: int, seconds: float) -> None:
     assert 0.95 < nis.mean() / 6 < 1.05
 
 
+def _each_alone(flight: Flight, grid: np.ndarray, options: FuseOptions) -> list[float]:
+    policies = [ConstantPolicy(np.full(6, 1e-6), 0.05, scalars[None]) for scalars in grid]
+    return [fuse_flight(flight, policy, options).scores.ate_rmse_m for policy in policies]
+
+
 def test_members_of_a_batch_are_independent_filters() -> None:
     flight, _ = _own_rule_flight(7, n=400)
     flight = replace(flight, truth_valid=np.ones(len(flight.records), bool))
     grid = np.array([[0.1, 1.0], [1.0, 4.0], [10.0, 0.2]])
     options = FuseOptions(sigmas=StartSigmas(), history_s=0.0)
-    together = fuse_flight(flight, ConstantPolicy(np.full(6, 1e-6), 0.05, grid), options, batch=3)
-    for scalars, member in zip(grid, together, strict=True):
-        alone = fuse_flight(flight, ConstantPolicy(np.full(6, 1e-6), 0.05, scalars[None]), options)[0]
-        np.testing.assert_allclose(member.T_world_imu, alone.T_world_imu, atol=1e-9)
-        np.testing.assert_allclose(member.covariance, alone.covariance, rtol=1e-6, atol=1e-12)
+    together = ate_of_members(flight, ConstantPolicy(np.full(6, 1e-6), 0.05, grid), options, batch=3)
+    np.testing.assert_allclose(together, _each_alone(flight, grid, options), rtol=1e-6)
 
 
 def test_tuning_a_constant_keeps_no_covariances() -> None:
@@ -311,4 +313,4 @@ def test_tuning_a_constant_keeps_no_covariances() -> None:
     peak = tracemalloc.get_traced_memory()[1]
     tracemalloc.stop()
     assert peak < 0.5 * len(flight.records) * len(grid) * 8 * CORE**2
-    np.testing.assert_array_equal(found, [r.scores.ate_rmse_m for r in fuse_flight(flight, policy, options, batch=64)])
+    np.testing.assert_allclose(found[::21], _each_alone(flight, grid[::21], options), rtol=1e-6)
