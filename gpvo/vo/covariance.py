@@ -157,8 +157,9 @@ class ResidualMoments:
     """Two linear equations ``A [p^2, m^2] = sums`` for the variances of pointing and matching [px^2].
 
     A residual's covariance is ``G S G^T + S``, ``S = diag(p^2, p^2, m^2)``: the mean square of each part is ``a p^2 + b
-    m^2``, and a share of ``a / (a + b)`` is pointing's. After a step of several baselines the row alone shows that: the
-    column is all disparity's. ``freedom``: degrees of freedom of the residuals, after six went to the motion.
+    m^2``. As that of a square scatters by as much, least squares weighs it by ``1 / (a + b)^2``, near enough: after a
+    step of several baselines, most parts are all disparity's, and must not outvote the few that show pointing.
+    ``freedom``: degrees of freedom of the residuals, after six went to the motion.
     """
 
     A: Array
@@ -170,9 +171,9 @@ class ResidualMoments:
         """Of the residuals (M, 3) of one motion, and their derivatives (3, 3, M) by the reference measurement."""
         by_u, by_v, by_d = (G**2 + np.eye(3)[:, :, None]).transpose(1, 0, 2)
         by = np.stack([by_u + by_v, by_d]).reshape(2, -1)
-        share = by / by.sum(axis=0)
+        weighed = 2.0 * by / by.sum(axis=0) ** 2  # at rest 1
         freedom = max(residuals.size - 6.0, 0.0)
-        return cls(share @ by.T * (freedom / residuals.size), share @ (residuals.T**2).ravel(), freedom)
+        return cls(weighed @ by.T * (freedom / residuals.size), weighed @ (residuals.T**2).ravel(), freedom)
 
     def plus(self, other: ResidualMoments, memory: float = 1.0) -> ResidualMoments:
         """Both together, this one fading."""

@@ -69,17 +69,23 @@ def test_sigmas_of_few_points(count: int) -> None:
     assert np.mean(scores) < 10
 
 
-@pytest.mark.parametrize("baselines", [0.5, 4.0, 10.0])
-def test_a_long_step_does_not_hide_pointing(baselines: float) -> None:
-    """Sideways by so many baselines, 0.05 px of each camera: NEES/dof stays near one (it was 23 at four, 140 at ten).
+@pytest.mark.parametrize(
+    ("baselines", "disparity_px"),
+    [((0.5, 0, 0), (4.0, 30.0)), ((4.0, 0, 0), (4.0, 30.0)), ((10.0, 0, 0), (4.0, 30.0)), ((0, 0, 17.0), (2.5, 18.0))],
+)
+def test_a_long_step_does_not_hide_pointing(
+    baselines: tuple[float, float, float], disparity_px: tuple[float, float]
+) -> None:
+    """By so many baselines, 0.05 px of each camera: NEES/dof stays near one (it was 23 at four sideways, 140 at ten,
+    and 4 at 17 ahead).
 
     Noise of disparity moves points by as many times as much, and what it shares with the column is in neither sigma.
     """
     rng = np.random.default_rng(3)
     sigmas, scores = SigmaEstimator(None, None), []
     for k in range(80):
-        _, before, _ = scene(rng, 150, (4.0, 30.0))
-        T = se3.exp(np.r_[baselines * CAMERA.baseline_m, 0.01, 0.01, rng.normal(0.0, 0.01, 3)])
+        _, before, _ = scene(rng, 150, disparity_px)
+        T = se3.exp(np.r_[np.multiply(baselines, CAMERA.baseline_m) + 0.01, rng.normal(0.0, 0.01, 3)])
         after = transfer(T, before, CAMERA).uvd.T
         motion = refine(T, noisy(rng, before, 0.05), noisy(rng, after, 0.05), CAMERA)
         assert motion is not None
@@ -88,7 +94,7 @@ def test_a_long_step_does_not_hide_pointing(baselines: float) -> None:
             S = pointing_matching_pixel_covariance(*sigmas.values)
             e = se3.log(se3.inverse(T) @ motion.T_prev_cur)
             scores.append(e @ np.linalg.solve(motion_covariance(motion.T_prev_cur, motion.uvd_prev, CAMERA, S).full, e))
-    assert 0.7 < np.mean(scores) / 6 < 1.5
+    assert 0.6 < np.mean(scores) / 6 < 1.5
 
 
 @pytest.mark.parametrize(("shared_px", "least", "most"), [(0.0, 0.85, 1.15), (0.15, 2.5, 8.0)])
