@@ -70,11 +70,16 @@ def test_sigmas_of_few_points(count: int) -> None:
 
 
 @pytest.mark.parametrize(
-    ("baselines", "disparity_px"),
-    [((0.5, 0, 0), (4.0, 30.0)), ((4.0, 0, 0), (4.0, 30.0)), ((10.0, 0, 0), (4.0, 30.0)), ((0, 0, 17.0), (2.5, 18.0))],
+    ("baselines", "disparity_px", "least"),
+    [
+        ((0.5, 0, 0), (4.0, 30.0), 0.7),
+        ((4.0, 0, 0), (4.0, 30.0), 0.7),
+        ((10.0, 0, 0), (4.0, 30.0), 0.7),
+        ((0, 0, 17.0), (2.5, 18.0), 0.6),  # 0.77 over eight draws: what little shows pointing is noisy
+    ],
 )
 def test_a_long_step_does_not_hide_pointing(
-    baselines: tuple[float, float, float], disparity_px: tuple[float, float]
+    baselines: tuple[float, float, float], disparity_px: tuple[float, float], least: float
 ) -> None:
     """By so many baselines, 0.05 px of each camera: NEES/dof stays near one (it was 23 at four sideways, 140 at ten,
     and 4 at 17 ahead).
@@ -94,7 +99,7 @@ def test_a_long_step_does_not_hide_pointing(
             S = pointing_matching_pixel_covariance(*sigmas.values)
             e = se3.log(se3.inverse(T) @ motion.T_prev_cur)
             scores.append(e @ np.linalg.solve(motion_covariance(motion.T_prev_cur, motion.uvd_prev, CAMERA, S).full, e))
-    assert 0.6 < np.mean(scores) / 6 < 1.5
+    assert least < np.mean(scores) / 6 < 1.5
 
 
 @pytest.mark.parametrize(("shared_px", "least", "most"), [(0.0, 0.85, 1.15), (0.15, 2.5, 8.0)])
