@@ -116,9 +116,14 @@ def _fly(
     )
     seen = observe(scenario, at_frames.t_s, T_world_cam, cloud, episodes, streams, bodies)
     track, uv_left, uv_right = (np.concatenate(of_frames) for of_frames in zip(*seen))
+    frame = np.repeat(np.arange(len(seen)), [len(of_frame[0]) for of_frame in seen])
+    if scenario.shared_px:
+        uvd = np.column_stack([uv_left, uv_left[:, 0] - uv_right[:, 0]])
+        shift = _shared_px(scenario, frame, track, uvd, streams[6])
+        uv_left, uv_right = uv_left + shift[:, :2], uv_right + shift[:, :2] - shift[:, 2:] * [1.0, 0.0]
     return PointsFlight(
         scenario=scenario,
-        frame=np.repeat(np.arange(len(seen)), [len(of_frame[0]) for of_frame in seen]).astype(np.int32),
+        frame=frame.astype(np.int32),
         track=track.astype(np.int32),
         uv_left=uv_left.astype(np.float32),
         uv_right=uv_right.astype(np.float32),
@@ -144,7 +149,7 @@ def observe(
     total = len(cloud) + sum(len(b.points) for b in bodies)
     active = np.zeros(total, bool)
     generation = np.zeros(total, np.int64)
-    last_uv, kept_px = np.full((total, 2), np.nan), np.zeros(total)
+    last_uv, kept = np.full((total, 2), np.nan), _Kept(scenario, total, streams[6])
     out: list[Seen] = []
     for k, t in enumerate(t_s):
         if scenario.frozen and scenario.frozen[0] <= t < scenario.frozen[1] and out:
@@ -156,31 +161,75 @@ def observe(
             continue
         bad = next((e for e in episodes if e.begin_s <= t < e.end_s), None)
         points = np.concatenate([cloud, *(b.at(k, streams[6]) for b in bodies)]) if bodies else cloud
-        left, right, visible, depth = _visible(rig, T_world_cam[k], points, scenario.reach_m)
+        left, right, visible, depth = _visible(rig, T_world_cam[k], points, _of_frame(scenario.reach_m, k))
         if bodies:
             visible &= ~events.hidden(bodies, len(cloud), left, depth)
-        wanted = int(scenario.tracks * (bad.count_factor if bad else 1.0))
+        wanted = int(_of_frame(scenario.tracks, k) * (bad.count_factor if bad else 1.0))
         before = active.copy()
-        _renew(active, generation, visible, wanted, min(1.0, scenario.drop * (3.0 if bad else 1.0)), life)
-        i, new = np.flatnonzero(active), np.flatnonzero(active & ~before)
-        if scenario.persistent_px:
-            kept_px[new] = scenario.persistent_px * streams[6].standard_normal(len(new))
+        drop = min(1.0, _of_frame(scenario.drop, k) * (3.0 if bad else 1.0))
+        _renew(active, generation, visible, wanted, drop, life)
+        i = np.flatnonzero(active)
+        moved_px, apart_px = kept.follow(k, i, np.flatnonzero(active & ~before))
         flow = np.hypot(*(left[i] - last_uv[i]).T)
         last_uv[:] = np.nan
         last_uv[i] = left[i]
-        sigma = quality * (scenario.sigma_px + scenario.blur_px * np.nan_to_num(flow))
+        sigma = quality * (_of_frame(scenario.sigma_px, k) + scenario.blur_px * np.nan_to_num(flow))
         if bad:
             sigma = sigma * bad.sigma_factor
         if scenario.noise_every and k % scenario.noise_every == 0:
             sigma = np.hypot(sigma, scenario.noise_px)
         n = len(i)
-        uv_left = left[i] + sigma[:, None] * noise.standard_normal((n, 2))
-        uv_right = right[i] + sigma[:, None] * noise.standard_normal((n, 2))
-        uv_right[:, 0] -= kept_px[i]
-        wrong = noise.random(n) < scenario.outliers * (bad.outlier_factor if bad else 1.0)
+        uv_left = left[i] + moved_px + sigma[:, None] * noise.standard_normal((n, 2))
+        uv_right = right[i] + moved_px + sigma[:, None] * noise.standard_normal((n, 2))
+        uv_right[:, 0] -= apart_px
+        wrong = noise.random(n) < _of_frame(scenario.outliers, k) * (bad.outlier_factor if bad else 1.0)
         jump = noise.uniform(-25, 25, (n, 2)) * wrong[:, None]
         out.append((i + generation[i] * total, uv_left + jump, uv_right + jump))
     return out
+
+
+def _shared_px(
+    scenario: PointsScenario, frame: NDArray[np.int64], track: NDArray[np.int64], uvd: Array, rng: np.random.Generator
+) -> Array:
+    """(M, 3) errors of observations (u, v, d) [px] that points share, as :mod:`gpvo.twin.common` finds them."""
+    from gpvo.twin.bundle import Observations
+    from gpvo.twin.common import CommonField
+
+    index = np.unique(track, return_inverse=True)[1]
+    seen = Observations(scenario.camera, frame, index, uvd, np.ones(len(frame), bool))
+    variance = np.zeros((4, 2))
+    variance[: len(scenario.shared_px)] = np.square(scenario.shared_px)
+    return CommonField.like(variance, 1.0 / scenario.rate_hz, seen).draw(seen, rng)
+
+
+def _of_frame(values: float | tuple[float, ...], k: int) -> float:
+    """The value of frame ``k``: the only one, or of several in turn."""
+    return values[k % len(values)] if isinstance(values, (tuple, list)) else values
+
+
+class _Kept:
+    """Errors that each of ``total`` points keeps while it is followed: one of its disparity, and a slip in both images
+    that goes on in nearly the same direction, a first-order Gauss-Markov process in its velocity."""
+
+    def __init__(self, scenario: PointsScenario, total: int, rng: np.random.Generator) -> None:
+        self._scenario, self._rng = scenario, rng
+        self._usual_px = float(np.median(scenario.sigma_px))
+        self._memory = float(np.exp(-1.0 / (scenario.rate_hz * scenario.drift_s)))
+        self._apart_px, self._moved_px, self._pace = np.zeros(total), np.zeros((total, 2)), np.zeros((total, 2))
+
+    def follow(self, k: int, seen: NDArray[np.int64], new: NDArray[np.int64]) -> tuple[Array, Array]:
+        """Shifts (n, 2) in both images and of the disparity (n,) [px] of the points seen in frame ``k``."""
+        chosen = self._scenario
+        level = _of_frame(chosen.sigma_px, k) / self._usual_px if self._usual_px else 1.0
+        if chosen.persistent_px:
+            self._apart_px[new] = level * chosen.persistent_px * self._rng.standard_normal(len(new))
+        if chosen.drift_px:
+            m = self._memory
+            self._pace[seen] = m * self._pace[seen] + (1 - m * m) ** 0.5 * self._rng.standard_normal((len(seen), 2))
+            self._pace[new] = self._rng.standard_normal((len(new), 2))
+            self._moved_px[seen] += level * chosen.drift_px * self._pace[seen]
+            self._moved_px[new] = 0.0
+        return self._moved_px[seen], self._apart_px[seen]
 
 
 def _renew(

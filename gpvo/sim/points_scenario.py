@@ -31,13 +31,19 @@ class PointsScenario:
     camera: StereoCamera = field(default_factory=lambda: StereoCamera(380.0, 380.0, 319.5, 239.5, 0.12, 640, 480))
     imu: str = "euroc"
     imu_rate_hz: float = 200.0
-    tracks: int = 220  # wanted per frame
-    sigma_px: float = 0.15  # of each image coordinate
+    # These five: one value, or several, of the frames in turn and then from the first again.
+    tracks: int | tuple[int, ...] = 220  # wanted per frame
+    sigma_px: float | tuple[float, ...] = 0.15  # of each image coordinate
+    outliers: float | tuple[float, ...] = 0.03  # share of the tracks that jump
+    drop: float | tuple[float, ...] = 0.04  # share of the tracks that end, per frame
+    reach_m: float | tuple[float, ...] = 40.0  # as far as points are seen
+    # At the median of sigma_px, and in proportion to it elsewhere.
     persistent_px: float = 0.0  # of a point's disparity, the same for as long as it is followed
+    drift_px: float = 0.0  # by which a followed point slips in both images, per frame and coordinate, for about drift_s
+    drift_s: float = 1.0
+    shared_px: tuple[tuple[float, float], ...] = ()  # of (u, v) and d, by all points, of each of twin.common.KINDS
     blur_px: float = 0.008  # further noise per pixel of image motion
     spread: float = 0.15  # standard deviation of log sigma between flights
-    outliers: float = 0.03  # share of the tracks that jump
-    drop: float = 0.04  # share of the tracks that end, per frame
     episodes_share: float = 0.0  # share of the flight in episodes in which VO gets ten times worse
     causes: tuple[str, ...] = tuple(CAUSES)  # of the episodes
     noise_every: int = 0  # every n-th frame is noisy by noise_px
@@ -48,7 +54,6 @@ class PointsScenario:
     smoke: float = 0.0  # share of the time with a plume that drifts along
     dust: float = 0.0  # share of the time with dust that turns about the vehicle
     texture: float = 1.0  # share of the world's points that are there
-    reach_m: float = 40.0  # as far as points are seen
     tolerance: Tolerance = field(default_factory=Tolerance)
     offset: Tolerance = field(default_factory=Tolerance)  # fixed part of the difference
 
@@ -67,6 +72,7 @@ def _landmarks_alone(table: Mapping[str, Any]) -> PointsScenario:
     return PointsScenario(**{name: values[name] for name in field_names(PointsScenario) if name in values})
 
 
+_MOST_FRAMES = 1_000_000
 FOLDER = Path(__file__).parent / "scenarios"
 
 
@@ -87,16 +93,29 @@ def _list_of(fits: Callable[[Any], bool], count: int | None = None) -> Callable[
     return lambda v: isinstance(v, (list, tuple)) and count in (None, len(v)) and all(map(fits, v))
 
 
+def _one_or_more(fits: Callable[[Any], bool]) -> Callable[[Any], bool]:
+    several = _list_of(fits)
+    return lambda v: fits(v) or (several(v) and 0 < len(v) <= _MOST_FRAMES)
+
+
 _are_times, _is_place = _list_of(_within(0.0, 1e6), 2), _list_of(_within(-1e6, 1e6), 3)
 _are_causes = _list_of(lambda c: c in tuple(CAUSES))
 
 
 _RULES: tuple[tuple[str, str, Callable[[Any], bool]], ...] = (
-    ("duration_s rate_hz imu_rate_hz reach_m", "a number from 0.1 to 1e6", _within(0.1, 1e6)),
-    ("rest_s speed_mps sigma_px persistent_px blur_px spread noise_px", "a number from 0 to 1e3", _within(0.0, 1e3)),
-    ("outliers drop smoke dust texture", "a share from 0 to 1", _within(0.0, 1.0)),
+    ("duration_s rate_hz imu_rate_hz drift_s", "a number from 0.1 to 1e6", _within(0.1, 1e6)),
+    ("rest_s speed_mps persistent_px drift_px blur_px spread noise_px", "a number from 0 to 1e3", _within(0.0, 1e3)),
+    ("reach_m", "a number from 0.1 to 1e6, or a list of them", _one_or_more(_within(0.1, 1e6))),
+    (
+        "shared_px",
+        "up to four pairs of numbers from 0 to 1e3, [[u and v, d], ...]",
+        lambda v: _list_of(_list_of(_within(0.0, 1e3), 2))(v) and len(v) <= 4,
+    ),
+    ("smoke dust texture", "a share from 0 to 1", _within(0.0, 1.0)),
+    ("sigma_px", "a number from 0 to 1e3, or a list of them", _one_or_more(_within(0.0, 1e3))),
+    ("outliers drop", "a share from 0 to 1, or a list of them", _one_or_more(_within(0.0, 1.0))),
     ("episodes_share", "a share from 0 to 0.5", _within(0.0, 0.5)),
-    ("tracks", "a whole number from 1 to 100000", _within(1, 1e5, int)),
+    ("tracks", "a whole number from 1 to 100000, or a list of them", _one_or_more(_within(1, 1e5, int))),
     ("cars noise_every", "a whole number from 0 to 1000", _within(0, 1e3, int)),
     ("world_seed", "a whole number from 0 on", lambda v: v is None or _within(0, float("inf"), int)(v)),
     (
@@ -122,4 +141,9 @@ def check_values(values: Mapping[str, object], prefix: str = "") -> None:
     for names, wanted, fits in _RULES:
         for name in names.split():
             if name in values and not fits(values[name]):
-                raise GpvoError(f"{prefix}{name} is {values[name]!r}", cure=f"give {wanted}")
+                raise GpvoError(f"{prefix}{name} is {_short(values[name])}", cure=f"give {wanted}")
+
+
+def _short(value: object) -> str:
+    text = repr(value)
+    return text if len(text) <= 80 else f"{text[:77]}..."

@@ -61,7 +61,7 @@ class CommonField:
         ``t_ns`` (F,) stamps. None is found where fewer than forty motions have twenty points.
         """
         step_s = max(float(np.median(np.diff(t_ns))) * 1e-9, 1e-6) if len(t_ns) > 1 else 1.0
-        pairs = _pairs(seen, structure)
+        pairs = _pairs(seen, structure.weight > 0)
         S, N = _modes(seen, structure, noise_px, signs, pairs)
         pace = _pace(seen, len(S), pairs)
         lengths = [max(1, round(s / step_s)) for s in _BLOCKS_S]
@@ -82,6 +82,11 @@ class CommonField:
             excess = (energy[0] - energy[1:].mean(axis=0)) / scatter
             variance = nnls(units.reshape(-1, len(scatter)).T, excess)[0].reshape(-1, 2)
         return cls(variance, step_s, pace)
+
+    @classmethod
+    def like(cls, variance_px2: Array, step_s: float, seen: Observations) -> CommonField:
+        """One of known variances (4, 2), at the pace of what was seen."""
+        return cls(variance_px2, step_s, _pace(seen, int(seen.frame.max(initial=-1)) + 1, _pairs(seen, seen.trusted)))
 
     def draw(self, seen: Observations, rng: np.random.Generator) -> Array:
         """(M, 3) the field [px] at the observations."""
@@ -141,10 +146,10 @@ def _at(c: Array, seen: Observations) -> Array:
     return np.stack([np.einsum("mb,mb->m", B, c[seen.frame, i : i + 6]) for i in (0, 6, 12)], axis=1)
 
 
-def _pairs(seen: Observations, structure: Structure) -> Pairs:
-    """Consecutive observations of a track that the fit used, in order of the later frame."""
+def _pairs(seen: Observations, used: NDArray[np.bool_]) -> Pairs:
+    """Consecutive observations of a track that are used (M,), in order of the later frame."""
     order = np.lexsort((seen.frame, seen.track))
-    order = order[structure.weight[order] > 0]
+    order = order[used[order]]
     a, b = order[:-1], order[1:]
     paired = (seen.track[a] == seen.track[b]) & (seen.frame[b] - seen.frame[a] <= _MAX_GAP)
     by_frame = np.argsort(b[paired])

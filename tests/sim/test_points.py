@@ -98,3 +98,50 @@ def test_frames_come_at_the_rate_that_was_asked_for(rate_hz):
 def test_a_rate_or_duration_that_is_none_is_refused(name, value):
     with pytest.raises(GpvoError, match=name):
         simulate_points("tunnel-clean", 0, **{name: value})
+
+
+IN_TURN = {"tracks": 90, "sigma_px": 0.2, "outliers": 0.1, "drop": 0.05, "reach_m": 20.0}
+
+
+def test_values_of_the_frames_in_turn():
+    one = simulate_points("tunnel-clean", 2, duration_s=4.0, persistent_px=0.3, **IN_TURN)
+    several = simulate_points(
+        "tunnel-clean", 2, duration_s=4.0, persistent_px=0.3, **{n: (v,) * 3 for n, v in IN_TURN.items()}
+    )
+    assert np.array_equal(one.uv_right, several.uv_right)
+    counts = np.bincount(simulate_points("tunnel-clean", 2, duration_s=4.0, tracks=[50, 20]).frame)
+    assert (counts[::2] == 50).all()
+    assert (counts[1::2] == 20).all()
+
+
+@pytest.mark.parametrize("name", IN_TURN)
+@pytest.mark.parametrize(
+    "bad", [[], [-1], [float("nan")], ["many"], [[1]], [0.1] * 99 + [float("inf")], {}, None, True]
+)
+def test_values_that_are_none_are_refused(name, bad):
+    with pytest.raises(GpvoError, match=name) as refused:
+        simulate_points("tunnel-clean", 0, **{name: bad})
+    assert len(str(refused.value)) < 200
+    assert "\n" not in str(refused.value)
+
+
+@pytest.mark.parametrize("bad", [0.1, [0.1], [[0.1]], [[0.1, -0.1]], [[0.1, float("nan")]], [[0.1, 0.1]] * 5])
+def test_shared_errors_that_are_none_are_refused(bad):
+    with pytest.raises(GpvoError, match="shared_px"):
+        simulate_points("tunnel-clean", 0, shared_px=bad)
+
+
+def test_a_point_slips_on_in_both_images():
+    """The variance of a sum of n steps with correlation m: s^2 (n (1 + m) / (1 - m) - 2 m (1 - m^n) / (1 - m)^2)."""
+    still = {"path": "hover", "duration_s": 6.0, "sigma_px": 0.0, "blur_px": 0.0, "outliers": 0.0, "drop": 0.0}
+    clean = simulate_points("room-t265", 1, **still)
+    slipping = simulate_points("room-t265", 1, drift_px=0.1, **still)
+    assert np.array_equal(clean.track, slipping.track)
+    left, right = slipping.uv_left - clean.uv_left, slipping.uv_right - clean.uv_right
+    assert np.abs(left - right).max() < 1e-3
+    m, n = np.exp(-1 / 20), 20
+    expected = 0.1**2 * (n * (1 + m) / (1 - m) - 2 * m * (1 - m**n) / (1 - m) ** 2)
+    begun = clean.track[clean.frame == 0]
+    at_n = (clean.frame == n) & np.isin(clean.track, begun)
+    assert left[at_n].var() == pytest.approx(expected, rel=0.25)
+    assert np.abs(left[clean.frame == 0]).max() == 0.0
