@@ -22,6 +22,7 @@ from gpvo.vo.quality import (
     PairWatch,
     Verdict,
     agrees,
+    far_px,
     judge,
     lateness_covariance,
     median_parallax_px,
@@ -33,7 +34,6 @@ from gpvo.vo.rivals import Choice, areas, choose, explained, unexplained, untang
 from gpvo.vo.state import State, Stopwatch, own_frame
 from gpvo.vo.window import Window
 
-_RIVAL_STAYS = 0.85  # per frame
 _NEAR = 3.0  # standard deviations of the noise that the last motions had
 _SAME = 0.01  # of the noise: what displaces all points alike by less is less than their mean is known to
 
@@ -223,19 +223,19 @@ class StereoOdometry:
         free = unexplained(motion, shares[0], matches, self.camera, near_px)
         second = None if free is None else self._estimate(matches, free)
         covered = (1, 0) if second is None else areas(motion, second, matches, self.camera, near_px)
-        state.rivalry = _RIVAL_STAYS * state.rivalry + float(covered[1] > 0)
+        state.meet(t_ns, far_px(matches, motion.inliers), rival=covered[1] > 0)
         motions = [motion]
         if second is not None and covered[1] > 0:
             state.rival = motion.inliers | second.inliers
             motions.append(second)
             shares.append(explained(second, matches, self.camera, near_px, margin_px))
             doubts.append(f"two motions, over {covered[0]} and {covered[1]} parts of the image")
-        elif state.rivalry > 1.5:
+        elif state.remembers_rival:
             doubts.append("two motions in the frames before")
         expected = state.expected(t_ns, guess, self.config.max_acceleration_mps2)
         chosen = choose(motions, covered, expected, lambda i, on: state.unseen(shares[i], expected, goes_on=on))
         if len(motions) == 1 and chosen.plausible:  # a rival that is not found in one frame has not gone
-            chosen = replace(chosen, otherwise=_RIVAL_STAYS * state.in_doubt)
+            chosen = replace(chosen, otherwise=state.rival_stays * state.in_doubt)
         state.odds, state.in_doubt = chosen.odds, chosen.otherwise
         T_ref_cur = motions[chosen.index].T_prev_cur
         state.clock(t_ns, T_ref_cur)
@@ -373,6 +373,8 @@ class StereoOdometry:
         parallax_px = median_parallax_px(matches, inliers)
         sigma_m = motion.worst_translation_sigma_m
         state.believe(record.t_ns, record.T_prev_cur, parallax_px, int(inliers.sum()), choice, sigma_m)
+        if record.status is Status.OK:
+            state.horizon.see(record.disparity_p10_px)
         self.rig_error.twist = state.twist
         if state.suffices(parallax_px, config) and inliers.sum() > 0.6 * state.reference_points:
             return False, (state.reference_points, state.reference_points)

@@ -31,7 +31,8 @@ _AREA = 0.5  # power of the parts covered in the odds of being the scene, frame 
 _UNSEEN = -0.2  # log odds of the expected motion that nothing in the image makes
 _REMEMBERED_S = 4.0  # for so long the parts that a motion explained speak for it
 _SUREST = 3.0  # log odds at most: whoever is surer could not be put right
-_LONGEST_DOUBT_NS = 30 * 10**9
+_IN_FRONT = 1.5  # times as near as usual: the farthest points of what hides the scene
+LONGEST_DOUBT_NS = 30 * 10**9
 _REGAINED = 0.3  # log odds, with each frame in which nothing speaks against the motion
 
 
@@ -87,7 +88,7 @@ class Leaps:
         one that was left by ``reach_mps``."""
         if self.before is None or (self.contradicted and not self.differs(last, reach_mps)):
             self.before, self.left_ns, self.contradicted = last, t_last_ns, False
-            self.until_ns = t_ns + min(t_last_ns - self.began_ns, _LONGEST_DOUBT_NS)
+            self.until_ns = t_ns + min(t_last_ns - self.began_ns, LONGEST_DOUBT_NS)
         elif not self.differs(now, reach_mps):
             self.before = None
         self.began_ns = t_ns
@@ -103,12 +104,34 @@ class Leaps:
             return "the IMU felt otherwise than the velocity changed"
         return "the velocity leapt: what it was before may be the scene's"
 
-    def doubted(self, t_ns: int) -> Array | None:
-        """(6,) the velocity that may still be the scene's at ``t_ns`` instead; None where the one seen is believed."""
-        until_ns = self.began_ns + _LONGEST_DOUBT_NS if self.contradicted else self.until_ns
+    def doubted(self, t_ns: int, *, hidden: bool = False) -> Array | None:
+        """(6,) the velocity that may still be the scene's at ``t_ns`` instead; None where the one seen is believed.
+        ``hidden``: whether what is seen may hide the scene."""
+        until_ns = self.began_ns + LONGEST_DOUBT_NS if self.contradicted or hidden else self.until_ns
         if self.before is not None and t_ns > until_ns:
             self.before = None
         return self.before
+
+
+@dataclass
+class Horizon:
+    """How far away the farthest points usually are in motions that nothing speaks against.
+
+    What hides the scene lies in front of it. So a doubt does not end with time alone while the farthest points of the
+    motion that is followed are nearer than usual: the other one is not seen, as something hides it.
+    """
+
+    mean: float = 0.0  # log of the disparity that a tenth of the points fall short of
+    motions: int = 0
+
+    def see(self, far_px: float) -> None:
+        """A motion that nothing speaks against, of which a tenth of the points have less disparity than this."""
+        self.motions += 1
+        self.mean += (float(np.log(far_px)) - self.mean) / self.motions
+
+    def hidden(self, far_px: float) -> bool:
+        """Whether a motion with this disparity may be that of something in front of the scene."""
+        return self.motions > 0 and float(np.log(far_px / _IN_FRONT)) > self.mean
 
 
 @dataclass

@@ -17,8 +17,10 @@ from gpvo.vo.config import VoConfig
 from gpvo.vo.felt import Felt
 from gpvo.vo.frontend import Observation
 from gpvo.vo.motion import NO_TWIST
-from gpvo.vo.rivals import EXPLAINED, Choice, Expected, Leaps, Standing
+from gpvo.vo.rivals import EXPLAINED, LONGEST_DOUBT_NS, Choice, Expected, Horizon, Leaps, Standing
 
+_RIVAL_STAYS = 0.85  # per frame
+_SEVERAL = 1.5  # of the running sum: a second motion that was found time and again
 _GUESS_S = 0.5  # for so long a velocity is taken to last
 _SIGMAS_WITHIN_REACH = 5.0  # of what a vehicle can do
 _TOO_FAST_NS = 200_000  # for three frames: by arrival, two may come at once
@@ -64,6 +66,10 @@ class State:
     usual_inliers: float = 0.0
     rival: NDArray[np.bool_] | None = None  # the points of the last motion and of its rival, if there was one
     rivalry: float = 0.0  # running sum over the frames in which a second motion was seen
+    t_rival_ns: int = 0  # when the last one was
+    rival_stays: float = _RIVAL_STAYS  # share of the doubt that is left by a frame in which it was not
+    horizon: Horizon = field(default_factory=Horizon)
+    hidden: bool = False  # whether what was seen last may hide the scene
     in_doubt: Array = field(default_factory=lambda: np.zeros((6, 6)))  # covariance of having taken the wrong motion
     odds: float = 0.0  # log odds that the last velocity is that against the scene
     standing: Standing = field(default_factory=Standing)
@@ -111,6 +117,20 @@ class State:
     def has_rival(self) -> bool:
         """Whether a second motion was seen in one of the last ten frames."""
         return self.rivalry > 0.2
+
+    @property
+    def remembers_rival(self) -> bool:
+        """Whether a second motion was seen time and again in the frames before."""
+        return self.rivalry >= _SEVERAL
+
+    def meet(self, t_ns: int, far_px: float, *, rival: bool) -> None:
+        """A motion was found, a tenth of its points with less disparity than this, and a second one or not. What was
+        found time and again is not forgotten while the first may hide it."""
+        self.hidden = self.horizon.hidden(far_px)
+        held = self.hidden and self.remembers_rival and t_ns - self.t_rival_ns < LONGEST_DOUBT_NS
+        self.rival_stays = 1.0 if held else _RIVAL_STAYS
+        self.rivalry = max(_RIVAL_STAYS * self.rivalry, _SEVERAL if held else 0.0) + float(rival)
+        self.t_rival_ns = t_ns if rival else self.t_rival_ns
 
     @property
     def is_disputed(self) -> bool:
@@ -212,7 +232,7 @@ class State:
     def otherwise(self, t_ns: int, T_ref_cur: Array, max_acceleration_mps2: float) -> Array | None:
         """Covariance (6, 6) of the motion from the reference while a velocity that was left may still be the scene's;
         None where there is no doubt."""
-        before = self.leaps.doubted(t_ns)
+        before = self.leaps.doubted(t_ns, hidden=self.hidden)
         if before is None:
             return None
         dt_s = (t_ns - self.t_ref_ns) * 1e-9

@@ -1,6 +1,7 @@
 """Which of several motions is the scene's: belief goes on, gives way to lasting evidence, and never takes all."""
 
 from dataclasses import replace
+from itertools import islice
 
 import numpy as np
 import pytest
@@ -13,8 +14,8 @@ from gpvo.types import Status, VoLog
 from gpvo.vo.config import make_config
 from gpvo.vo.motion import Motion
 from gpvo.vo.odometry import StereoOdometry
-from gpvo.vo.rivals import Expected, Leaps, Standing, choose
-from gpvo.vo.state import Jitter
+from gpvo.vo.rivals import Expected, Horizon, Leaps, Standing, choose
+from gpvo.vo.state import Jitter, State
 from hypothesis import given
 from hypothesis import strategies as st
 
@@ -71,6 +72,39 @@ def test_a_leap_is_in_doubt_until_one_leads_back_or_it_has_lasted_as_long():
     leaps.step(9 * seconds, before + 40.0, lorry, 9 * seconds, 12.0)  # no car has come there
     assert leaps.doubted(15 * seconds) is before
     assert leaps.doubted(17 * seconds) is None
+
+
+def test_what_is_nearer_than_the_scene_usually_is_may_hide_it():
+    horizon = Horizon()
+    assert not horizon.hidden(50.0)  # before there is a scene
+    for far_px in (4.0, 5.0, 6.0):
+        horizon.see(far_px)
+    assert not horizon.hidden(1.0)
+    assert not horizon.hidden(6.0)
+    assert horizon.hidden(10.0)
+
+
+def test_a_leap_stays_in_doubt_while_the_scene_may_be_hidden_but_not_for_ever():
+    leaps, still, fast = Leaps(0), np.zeros(6), np.array([0.0, 0.0, 9.0, 0.0, 0.0, 0.0])
+    leaps.step(2 * 10**9, still, fast, 2 * 10**9 - 1, 0.1)
+    assert leaps.doubted(5 * 10**9, hidden=True) is fast
+    assert replace(leaps).doubted(5 * 10**9) is None
+    assert leaps.doubted(33 * 10**9, hidden=True) is None
+
+
+def test_a_rival_is_remembered_while_the_scene_may_be_hidden_but_not_for_ever():
+    state = State.begin(0, 100, None)
+    state.horizon.see(5.0)
+    for k in range(5):
+        state.meet(k * 10**8, 5.0, rival=True)
+    for k in range(5, 300):
+        state.meet(k * 10**8, 20.0, rival=False)
+        assert state.remembers_rival
+    again = replace(state)
+    again.meet(30 * 10**9, 5.0, rival=False)
+    assert not again.remembers_rival
+    state.meet(31 * 10**9, 20.0, rival=False)
+    assert not state.remembers_rival
 
 
 def test_a_velocity_that_cannot_be_told_from_the_one_seen_ends_no_doubt():
@@ -183,6 +217,18 @@ def test_traffic_is_never_called_ok_and_is_covered(tmp_path, seed, with_imu):
     assert ok.sum() > (40 if with_imu else 50)  # nine of seed 1 are of a car that creeps, which an IMU tells
     assert (locked & ok).sum() <= (0.0 if with_imu else 0.005) * ok.sum()
     assert (locked & (wrong_m > 6 * sigma_m)).sum() <= 0.05 * locked.sum()
+
+
+def test_a_street_is_not_forgotten_while_a_car_may_hide_it(tmp_path):
+    """A car alongside fills more and more of the image, until the street is no motion of its own."""
+    path = simulate_points("street-traffic", 200, duration_s=40.0).save(tmp_path / "a.npz")
+    source, config = open_source(path), make_config(max_acceleration_mps2=12.0, max_turn_radps2=20.0)
+    source.imu = None
+    log = VoLog([step.record for step in islice(steps(source, config), 206)], source.camera)
+    wrong_m, ok, _ = wrong_and_ok(log, source.truth)
+    assert ok.sum() > 100
+    assert (wrong_m > 0.3).sum() > 40
+    assert not (ok & (wrong_m > 0.3)).any()
 
 
 @pytest.mark.parametrize(("seed", "least_ok"), [(32, 30), (205, 50), (220, 50)])
