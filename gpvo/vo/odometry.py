@@ -242,7 +242,7 @@ class StereoOdometry:
         chosen = choose(motions, covered, expected, lambda i, on: state.unseen(shares[i], expected, goes_on=on))
         if len(motions) == 1 and chosen.plausible:  # a rival that is not found in one frame has not gone
             chosen = replace(chosen, otherwise=state.rival_stays * state.in_doubt)
-        state.odds, state.in_doubt = chosen.odds, chosen.otherwise
+        state.odds, chosen = chosen.odds, replace(chosen, lasting=chosen.otherwise)
         T_ref_cur = motions[chosen.index].T_prev_cur
         state.clock(t_ns, T_ref_cur)
         if not chosen.plausible:

@@ -57,7 +57,8 @@ class Expected:
 class Choice:
     """Which motion is taken; covariance (6, 6) of its being another one; whether a vehicle can have made it; whether it
     tells the velocity, and is not just too noisy to contradict; log odds of what is expected from now on; whether the
-    velocity goes on from the last one."""
+    velocity goes on from the last one; ``lasting``: covariance that is stated of the next motion, too, once this one is
+    believed."""
 
     index: int = 0
     otherwise: Array = field(default_factory=lambda: np.zeros((6, 6)))
@@ -65,6 +66,7 @@ class Choice:
     tells: bool = True
     odds: float = 0.0
     goes_on: bool = True
+    lasting: Array = field(default_factory=lambda: np.zeros((6, 6)))
 
 
 @dataclass

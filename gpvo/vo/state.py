@@ -267,7 +267,7 @@ class State:
         self, t_ns: int, T_ref_cur: Array, parallax_px: float, inliers: int, choice: Choice, sigma_m: float
     ) -> None:
         """Take over a measured motion from the reference; its velocity, to ``sigma_m``, only where it tells it."""
-        self.twists = self.moving(t_ns, T_ref_cur)
+        self.twists, self.in_doubt = self.moving(t_ns, T_ref_cur), choice.lasting
         self.usual_inliers = inliers if self.usual_inliers == 0 else 0.9 * self.usual_inliers + 0.1 * inliers
         if choice.tells:
             self.twist, self.t_twist_ns = self._velocity(t_ns, T_ref_cur), t_ns

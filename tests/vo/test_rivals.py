@@ -273,3 +273,20 @@ def test_a_vehicle_whose_stamps_jitter_does_not_leap(tmp_path):
     late_ns = iter(np.random.default_rng(3).normal(0.0, 3e6, 400).astype(int).tolist())
     records = [odometry.step(replace(frame, t_ns=frame.t_ns + next(late_ns))) for frame in source]
     assert sum(r.status is Status.OK for r in records[1:]) > 0.9 * len(records[1:])
+
+
+def test_a_frozen_image_leaves_no_doubt_of_what_follows(tmp_path):
+    """Standing still is another motion than expected, but nobody believed it: its odds say nothing of the next ones.
+
+    A second after an image that froze for one, a street's sigmas had been 500 times what they were before.
+    """
+    source = open_source(simulate_points("street", 2, duration_s=10.0, frozen=(7.0, 8.0)).save(tmp_path / "f.npz"))
+    odometry = StereoOdometry(source.camera)
+    records = [odometry.step(frame) for frame in source]
+    assert all(r.status is Status.LOST for r in records[70:80])
+    assert all(r.status is Status.OK for r in records[80:])
+    before, after = (
+        max(np.sqrt(np.trace(r.covariances["triangulation"][:3, :3])) for r in records[part])
+        for part in (slice(60, 70), slice(81, 100))
+    )
+    assert after < 2 * before
