@@ -108,7 +108,9 @@ class StereoOdometry:
         guess = self._state.guess(frame.t_ns)
         matches, motion = self._solve(guess, clock)
         doubts = self.pair.step(seen, matches.right)
-        motion, choice = self._choose(matches, motion, guess, frame.t_ns, doubts)
+        frozen, choice = self._state.frozen(seen), Choice()
+        if not frozen:  # what stands still in a repeated image says nothing of the vehicle
+            motion, choice = self._choose(matches, motion, frame.t_ns, doubts)
         matches, motion = self._freed(matches, motion, frame.t_ns)
         clock.lap("motion")
         self.last = Followed(self._raw, np.zeros(len(self._raw.uvd_cur), bool) if motion is None else motion.inliers)
@@ -117,7 +119,7 @@ class StereoOdometry:
             motion,
             self.camera,
             self.config,
-            frozen=self._state.frozen(seen),
+            frozen=frozen,
             usual_inliers=self._state.usual_inliers,
             doubts=doubts,
         )
@@ -213,7 +215,7 @@ class StereoOdometry:
         return again, replace(refined, inliers=inliers)
 
     def _choose(
-        self, matches: Matches, motion: Motion | None, guess: Array, t_ns: int, doubts: list[str]
+        self, matches: Matches, motion: Motion | None, t_ns: int, doubts: list[str]
     ) -> tuple[Motion | None, Choice]:
         """The motion freed from points that do not move with the scene, or its rival among the points that disagree: a
         second one is added to the doubts, and so is a motion that the vehicle cannot make."""
@@ -238,7 +240,7 @@ class StereoOdometry:
             doubts.append(f"two motions, over {covered[0]} and {covered[1]} parts of the image")
         elif state.remembers_rival:
             doubts.append("two motions in the frames before")
-        expected = state.expected(t_ns, guess, self.config.max_acceleration_mps2)
+        expected = state.expected(t_ns, self.config.max_acceleration_mps2)
         chosen = choose(motions, covered, expected, lambda i, on: state.unseen(shares[i], expected, goes_on=on))
         if len(motions) == 1 and chosen.plausible:  # a rival that is not found in one frame has not gone
             chosen = replace(chosen, otherwise=state.rival_stays * state.in_doubt)

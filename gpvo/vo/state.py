@@ -74,6 +74,7 @@ class State:
     odds: float = 0.0  # log odds that the last velocity is that against the scene
     standing: Standing = field(default_factory=Standing)
     t_twist_ns: int | None = None  # when the velocity was last measured by a plausible motion
+    twist_over_s: float = 0.0  # the step whose mean velocity it is
     leaps: Leaps = field(default_factory=lambda: Leaps(0))
     refused: Array | None = None  # (6,) per second: the latest velocity that no vehicle could have reached
     t_refused_ns: int = 0
@@ -146,11 +147,12 @@ class State:
         dt_s = min((t_ns - self.t_believed_ns) * 1e-9, _GUESS_S)
         return self.T_ref_believed @ se3.exp(self.twist * dt_s)
 
-    def expected(self, t_ns: int, guess: Array, max_acceleration_mps2: float) -> Expected | None:
+    def expected(self, t_ns: int, max_acceleration_mps2: float) -> Expected | None:
         """The motion to ``t_ns`` expected from the last velocity of the vehicle; None before there is one."""
         if self.t_twist_ns is None:
             return None
         step_s, age_s = ((t_ns - since) * 1e-9 for since in (self.t_believed_ns, self.t_twist_ns))
+        age_s += 0.5 * (self.twist_over_s - step_s)  # from the middle of one step to that of the other
         jitter_m = self.jitter.reach_s * float(np.linalg.norm(self.twist[:3]))
         if self.refused is not None:
             was_off_m = float(np.linalg.norm((self.refused - self.twist)[:3])) * step_s
@@ -159,7 +161,8 @@ class State:
         T_refused = None if self.refused is None else self.T_ref_believed @ se3.exp(self.refused * step_s)
         reach_mps = max_acceleration_mps2 * age_s
         sigma_m = reach_mps * step_s / _SIGMAS_WITHIN_REACH
-        expected = Expected(guess, reach_mps * step_s + jitter_m, sigma_m, self.odds, T_refused)
+        T_same = self.T_ref_believed @ se3.exp(self.twist * step_s)
+        expected = Expected(T_same, reach_mps * step_s + jitter_m, sigma_m, self.odds, T_refused)
         if self.leaps.before is not None and self.leaps.contradicted:
             left_reach_mps = _SIGMAS_WITHIN_REACH * self._sigma_before_mps(t_ns, max_acceleration_mps2)
             if self.leaps.differs(self.twist, left_reach_mps):
@@ -271,6 +274,7 @@ class State:
         self.usual_inliers = inliers if self.usual_inliers == 0 else 0.9 * self.usual_inliers + 0.1 * inliers
         if choice.tells:
             self.twist, self.t_twist_ns = self._velocity(t_ns, T_ref_cur), t_ns
+            self.twist_over_s = (t_ns - self.t_believed_ns) * 1e-9
             if self.felt is not None:
                 sigma_mps = sigma_m / max((t_ns - self.t_believed_ns) * 1e-9, 1e-6)
                 doubted = self.leaps.before is not None

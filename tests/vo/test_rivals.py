@@ -290,3 +290,19 @@ def test_a_frozen_image_leaves_no_doubt_of_what_follows(tmp_path):
         for part in (slice(60, 70), slice(81, 100))
     )
     assert after < 2 * before
+
+
+@pytest.mark.parametrize(
+    ("name", "with_imu", "limits"),
+    [("tunnel-clean", True, {}), ("street", False, {"max_acceleration_mps2": 12.0, "max_turn_radps2": 20.0})],
+)
+def test_after_three_frozen_seconds_motions_are_good(tmp_path, name, with_imu, limits):
+    """All 81 (tunnel) and 15 (street) were doubtful: as if the vehicle had stood, then leapt; or, against its mean
+    velocity over the three seconds, as if it had leapt now."""
+    flight = simulate_points(name, 0, duration_s=14.0, frozen=(7.0, 10.0), rate_hz=20.0)
+    source = open_source(flight.save(tmp_path / "a.npz"))
+    if not with_imu:
+        source.imu = None
+    records = [step.record for step in steps(source, make_config(**limits))]
+    assert all(r.status is Status.LOST for r in records[141:200])
+    assert all(r.status is Status.OK for r in records[200:])
