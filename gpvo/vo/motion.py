@@ -248,7 +248,6 @@ def refine(
     robust: bool = True,
     noise: PointNoise = _PLAIN,
     tolerance_px: float = np.inf,
-    ample: float = np.inf,
     chosen_px: float | None = None,
 ) -> Motion | None:
     """Weighted reprojection error in left and right of the new frame, by Gauss-Newton.
@@ -260,12 +259,11 @@ def refine(
     derivative and biases the motion (errors in variables; B. Triggs et al., "Bundle adjustment, a modern synthesis",
     2000, section 6.1: this is the two-frame problem with the points eliminated).
 
-    If ``robust``, points within ``tolerance_px`` of the prediction are candidates, and where noise is more than
-    ``ample`` times as strong as at rest, those within as many times more. The noise scale is taken from their median
-    residual, those beyond its 99.9 % ellipsoid are left out, and the rest are weighted by Huber's rule. They are chosen
-    anew at each of the first six steps: a first motion from four noisy points disagrees with good ones, and without
-    these the estimate would be biased towards it. With a noise scale ``chosen_px`` all are kept: they were chosen
-    before, and ``T_start`` is near the end.
+    If ``robust``, points within ``tolerance_px`` of the prediction are candidates. The noise scale is taken from their
+    median residual, those beyond its 99.9 % ellipsoid are left out, and the rest are weighted by Huber's rule. They are
+    chosen anew at each of the first six steps: a first motion from four noisy points disagrees with good ones, and
+    without these the estimate would be biased towards it. With a noise scale ``chosen_px`` all are kept: they were
+    chosen before, and ``T_start`` is near the end.
 
     Returns None where the geometry leaves the motion undetermined.
     """
@@ -275,15 +273,14 @@ def refine(
         moved = transfer(T, smoothed, camera)
         back = (uvd_prev - smoothed).T
         r = uvd_cur.T - moved.uvd - np.einsum("ikn,kn->in", moved.G, back)
-        C = residual_covariance(moved.G, S, S, persistent)
-        W = whitener(C)
+        W = whitener(residual_covariance(moved.G, S, S, persistent))
         z = apply_whitener(W, r)
         if chosen_px is not None:
             keep, scale, weight = moved.in_front, chosen_px, huber((z**2).sum(0) / chosen_px**2)
         elif not robust:
             keep, scale, weight = moved.in_front, 1.0, np.ones(r.shape[1])
         elif iteration <= _CHOOSING:
-            close = moved.in_front & within(shortened(r, C, S, ample), tolerance_px)
+            close = moved.in_front & within(r, tolerance_px)
             if iteration <= _NEAR_FIRST and (near := close & (uvd_prev[:, 2] > TELLING_PX)).sum() >= _ENOUGH:
                 close = near
             keep, scale, weight = _robust_weights((z**2).sum(0), close)
@@ -338,16 +335,6 @@ def within(r: Array, tolerance_px: float) -> NDArray[np.bool_]:
     """(N,) whether residuals (3, N) of (u, v, d) are within a tolerance in the left image, and within one and a half in
     the disparity."""
     return (np.hypot(r[0], r[1]) < tolerance_px) & (np.abs(r[2]) < 1.5 * tolerance_px)
-
-
-def shortened(r: Array, C: Array, S: Array, ample: float) -> Array:
-    """Residuals (3, N) of covariance ``C`` (3, 3, N), those along which noise is more than ``ample`` times as strong as
-    between two frames at rest divided by as much: where the camera comes near, a small error of depth is a large one of
-    the prediction, which is no reason to leave a point out."""
-    if ample == np.inf:
-        return r
-    at_rest, now = 2.0 * np.einsum("in,ij,jn->n", r, S, r), np.einsum("in,ijn,jn->n", r, C, r)
-    return r / np.maximum(1.0, np.sqrt(now / np.maximum(at_rest, 1e-12)) / ample)
 
 
 def huber(ratio: Array) -> Array:

@@ -178,12 +178,6 @@ class StereoOdometry:
         """How far a point of the scene may be from where a motion puts it."""
         return max(self.config.ransac_threshold_px, _NEAR * self._noise.scale_px)
 
-    @property
-    def _ample(self) -> float:
-        """How many times as strong as at rest a point's noise may be before it may be farther."""
-        usual_px = _NEAR * self._noise.scale_px
-        return self._near_px / usual_px if usual_px else np.inf
-
     def _match(self, guess: Array, *, from_scratch: bool = False) -> Matches:
         """Matches of the front end, freed from what is known of the rig's errors."""
         assert self._frontend is not None
@@ -226,17 +220,17 @@ class StereoOdometry:
             return None, Choice()
         motion, held = untangled(motion, matches, self.camera, self._estimate)
         self.pair.note("held", held)
-        near_px, margin_px, ample = self._near_px, self.config.klt_window_px, self._ample
-        shares = [explained(motion, matches, self.camera, near_px, margin_px, ample)]
-        free = unexplained(motion, shares[0], matches, self.camera, near_px, ample)
+        near_px, margin_px = self._near_px, self.config.klt_window_px
+        shares = [explained(motion, matches, self.camera, near_px, margin_px)]
+        free = unexplained(motion, shares[0], matches, self.camera, near_px)
         second = None if free is None else self._estimate(matches, free)
-        covered = (1, 0) if second is None else areas(motion, second, matches, self.camera, near_px, ample)
+        covered = (1, 0) if second is None else areas(motion, second, matches, self.camera, near_px)
         state.meet(t_ns, far_px(matches, motion.inliers), rival=covered[1] > 0)
         motions = [motion]
         if second is not None and covered[1] > 0:
             state.rival = motion.inliers | second.inliers
             motions.append(second)
-            shares.append(explained(second, matches, self.camera, near_px, margin_px, ample))
+            shares.append(explained(second, matches, self.camera, near_px, margin_px))
             doubts.append(f"two motions, over {covered[0]} and {covered[1]} parts of the image")
         elif state.remembers_rival:
             doubts.append("two motions in the frames before")
@@ -286,10 +280,7 @@ class StereoOdometry:
         if (among & agrees(T_prev_cur, matches, camera, tolerance_px)).sum() < config.min_inliers:
             return None
         uvd_prev, uvd_cur = matches.uvd_prev[among], matches.uvd_cur[among]
-        noise = self._noise.value
-        motion = refine(
-            T_prev_cur, uvd_prev, uvd_cur, camera, noise=noise, tolerance_px=tolerance_px, ample=self._ample
-        )
+        motion = refine(T_prev_cur, uvd_prev, uvd_cur, camera, noise=self._noise.value, tolerance_px=tolerance_px)
         if motion is None:
             return None
         inliers = np.zeros(len(among), bool)

@@ -19,7 +19,7 @@ from gpvo.geometry import se3
 from gpvo.types import Array, StereoCamera
 from gpvo.vo.config import KNOWN_DEPTH_PX
 from gpvo.vo.frontend import Matches
-from gpvo.vo.motion import Motion, predict_uvd, residual_covariance, shortened, transfer
+from gpvo.vo.motion import Motion, predict_uvd, residual_covariance, transfer
 
 _CELLS = 96  # of the whole image
 EXPLAINED = 0.8  # share of the cells; below, a rival is looked for
@@ -264,20 +264,19 @@ def cells(uv: NDArray[np.floating[Any]], camera: StereoCamera) -> NDArray[np.int
 
 
 def unexplained(
-    motion: Motion, share: float, matches: Matches, camera: StereoCamera, near_px: float, ample: float = np.inf
+    motion: Motion, share: float, matches: Matches, camera: StereoCamera, near_px: float
 ) -> NDArray[np.bool_] | None:
     """(N,) the points, spare ones too, that moved otherwise, by over ``near_px``; None where the ``share`` that the
     motion explains is most of the image."""
     if share >= EXPLAINED:
         return None
-    off_px = _off_px(motion, matches, camera, ample)
-    free = (matches.uvd_prev[:, 2] > KNOWN_DEPTH_PX) & (off_px > max(near_px, 6 * motion.scale_px))
+    off_px = _off_px(motion.T_prev_cur, matches, camera)
+    noise_px = motion.scale_px * np.maximum(3 * _amplified(motion, matches, camera), 6)
+    free = (matches.uvd_prev[:, 2] > KNOWN_DEPTH_PX) & (off_px > np.maximum(near_px, noise_px))
     return free if free.sum() >= _LEAST else None
 
 
-def explained(
-    motion: Motion, matches: Matches, camera: StereoCamera, near_px: float, margin_px: float, ample: float = np.inf
-) -> float:
+def explained(motion: Motion, matches: Matches, camera: StereoCamera, near_px: float, margin_px: float) -> float:
     """Share of the cells with points of the reference, but for those that the motion puts out of sight, in which one
     agrees to ``near_px``; 1 where they are not known. ``margin_px`` of the image's border, points are not found.
 
@@ -285,7 +284,7 @@ def explained(
     """
     if matches.sought_uvd is None:
         return 1.0
-    off_px = _off_px(motion, matches, camera, ample)
+    off_px = _off_px(motion.T_prev_cur, matches, camera)
     (u, v, d), in_front = predict_uvd(motion.T_prev_cur, matches.sought_uvd, camera)
     inside = (u - d > margin_px) & (u < camera.width - margin_px) & (v > margin_px) & (v < camera.height - margin_px)
     tells, told = (uvd[:, 2] > KNOWN_DEPTH_PX for uvd in (matches.sought_uvd, matches.uvd_prev))
@@ -313,7 +312,7 @@ def untangled(
     moving = estimate(matches, ~still)
     if moving is None:
         return motion, False
-    off_px = _off_px(moving, matches, camera)
+    off_px = _off_px(moving.T_prev_cur, matches, camera)
     if (off_px[still] > 4 * _STILL_PX).sum() < _LEAST:  # by less, far points of the scene stay beside a car
         return motion, False
     held = still & (off_px > 2 * _STILL_PX)
@@ -323,15 +322,13 @@ def untangled(
     return (motion, False) if freed is None else (freed, True)
 
 
-def areas(
-    first: Motion, second: Motion, matches: Matches, camera: StereoCamera, near_px: float, ample: float = np.inf
-) -> tuple[int, int]:
+def areas(first: Motion, second: Motion, matches: Matches, camera: StereoCamera, near_px: float) -> tuple[int, int]:
     """Cells of the image in which each of two motions explains points to ``near_px``, and better than the other does.
 
     The second has none where it is that of an object, or a chance agreement: that is loose, as any place within the
     threshold is as likely.
     """
-    off_px = np.stack([_off_px(m, matches, camera, ample) for m in (first, second)])
+    off_px = np.stack([_off_px(m.T_prev_cur, matches, camera) for m in (first, second)])
     close = (off_px < near_px) & (off_px == off_px.min(axis=0))
     n_first, n_second = (len(np.unique(cells(matches.uvd_cur[c], camera))) for c in close)
     loose = second.scale_px > max(2 * first.scale_px, 0.25 * near_px)
@@ -339,9 +336,17 @@ def areas(
     return n_first, 0 if chance else n_second
 
 
-def _off_px(motion: Motion, matches: Matches, camera: StereoCamera, ample: float = np.inf) -> Array:
-    """(N,) distance [px] of each point from where the motion puts it, in image and disparity, :func:`shortened`."""
+def _off_px(T_prev_cur: Array, matches: Matches, camera: StereoCamera) -> Array:
+    """(N,) distance [px] of each point from where the motion puts it, in image and disparity."""
+    uvd, in_front = predict_uvd(T_prev_cur, matches.uvd_prev, camera)
+    off = np.linalg.norm(matches.uvd_cur - uvd.T, axis=1)
+    return np.where(in_front, off, np.inf)
+
+
+def _amplified(motion: Motion, matches: Matches, camera: StereoCamera) -> Array:
+    """(N,) how many times as strong as between two frames at rest a point's noise is along its residual: where the
+    camera comes near, a small error of depth is a large one of where the motion puts it."""
     moved, S = transfer(motion.T_prev_cur, matches.uvd_prev, camera), motion.noise.S
-    C = residual_covariance(moved.G, S, S, motion.noise.persistent)
-    off = np.linalg.norm(shortened(matches.uvd_cur.T - moved.uvd, C, S, ample), axis=0)
-    return np.where(moved.in_front, off, np.inf)
+    C, r = residual_covariance(moved.G, S, S, motion.noise.persistent), matches.uvd_cur.T - moved.uvd
+    at_rest, now = 2.0 * np.einsum("in,ij,jn->n", r, S, r), np.einsum("in,ijn,jn->n", r, C, r)
+    return np.sqrt(now / np.maximum(at_rest, 1e-12))
