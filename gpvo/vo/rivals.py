@@ -19,7 +19,7 @@ from gpvo.geometry import se3
 from gpvo.types import Array, StereoCamera
 from gpvo.vo.config import KNOWN_DEPTH_PX
 from gpvo.vo.frontend import Matches
-from gpvo.vo.motion import Motion, predict_uvd, residual_covariance, transfer
+from gpvo.vo.motion import Motion, predict_uvd
 
 _CELLS = 96  # of the whole image
 EXPLAINED = 0.8  # share of the cells; below, a rival is looked for
@@ -271,8 +271,7 @@ def unexplained(
     if share >= EXPLAINED:
         return None
     off_px = _off_px(motion.T_prev_cur, matches, camera)
-    noise_px = motion.scale_px * np.maximum(3 * _amplified(motion, matches, camera), 6)
-    free = (matches.uvd_prev[:, 2] > KNOWN_DEPTH_PX) & (off_px > np.maximum(near_px, noise_px))
+    free = (matches.uvd_prev[:, 2] > KNOWN_DEPTH_PX) & (off_px > max(near_px, 6 * motion.scale_px))
     return free if free.sum() >= _LEAST else None
 
 
@@ -341,12 +340,3 @@ def _off_px(T_prev_cur: Array, matches: Matches, camera: StereoCamera) -> Array:
     uvd, in_front = predict_uvd(T_prev_cur, matches.uvd_prev, camera)
     off = np.linalg.norm(matches.uvd_cur - uvd.T, axis=1)
     return np.where(in_front, off, np.inf)
-
-
-def _amplified(motion: Motion, matches: Matches, camera: StereoCamera) -> Array:
-    """(N,) how many times as strong as between two frames at rest a point's noise is along its residual: where the
-    camera comes near, a small error of depth is a large one of where the motion puts it."""
-    moved, S = transfer(motion.T_prev_cur, matches.uvd_prev, camera), motion.noise.S
-    C, r = residual_covariance(moved.G, S, S, motion.noise.persistent), matches.uvd_cur.T - moved.uvd
-    at_rest, now = 2.0 * np.einsum("in,ij,jn->n", r, S, r), np.einsum("in,ijn,jn->n", r, C, r)
-    return np.sqrt(now / np.maximum(at_rest, 1e-12))
