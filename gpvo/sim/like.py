@@ -53,7 +53,7 @@ def like(path: Path) -> dict[str, Any]:
         "trajectory": str(path),
         "vehicle": "path",
         "rest_s": _REST_S,
-        "duration_s": longest_flight_s((log.t_ns[-1] - log.t_ns[0]) * 1e-9),
+        "duration_s": longest_flight_s((log.t_ns[-1] - log.t_ns[0]) * 1e-9, _REST_S),
         "rate_hz": rate_hz,
         # A whole number of samples between frames.
         "imu_rate_hz": rate_hz * round(_IMU_HZ / rate_hz),
@@ -86,17 +86,22 @@ def _tracking(log: VoLog, tracks: StereoTracks, camera: StereoCamera, where: Pat
     usual_px = float(np.median(all_px))
     sigma_px = all_px * (1.0 - 0.5 * drift) ** 0.5
     counts = np.diff(np.searchsorted(tracks.t_ns, [*log.t_ns, log.t_ns[-1] + 1]))
+    step_s = float(np.median(np.diff(log.t_ns)) * 1e-9)
+    at_ns = _as_flown(log, step_s)
+    drop, wrong, noise_px, depth_m = (
+        tuple(np.interp(at_ns, t_ns, x).tolist()) for x in (ended_shares, outliers, sigma_px, reach_m)
+    )
     return {
         "shared_px": _shared_px(where),
-        "tracks": tuple(max(1, round(n)) for n in _as_flown(log, log.t_ns.astype(float), counts.astype(float))),
-        "drop": _as_flown(log, t_ns, ended_shares),
-        "outliers": _as_flown(log, t_ns, outliers),
-        "sigma_px": _as_flown(log, t_ns, sigma_px),
+        "tracks": tuple(max(1, round(n)) for n in np.interp(at_ns, log.t_ns, counts).tolist()),
+        "drop": drop,
+        "outliers": wrong,
+        "sigma_px": noise_px,
         "persistent_px": usual_px * noise.value.persistent**0.5,
         "drift_px": usual_px * drift**0.5,
-        "drift_s": float(np.clip(-np.median(np.diff(log.t_ns)) * 1e-9 / np.log(memory), 0.1, 1e6)),
+        "drift_s": float(np.clip(-step_s / np.log(memory), 0.1, 1e6)),
         "blur_px": 0.0,
-        "reach_m": _as_flown(log, t_ns, reach_m),
+        "reach_m": depth_m,
     }
 
 
@@ -139,12 +144,11 @@ def _shared_px(run: Path) -> tuple[tuple[float, float], ...]:
     return tuple((float(of_uv), float(of_d)) for of_uv, of_d in np.sqrt(common.variance_px2))
 
 
-def _as_flown(log: VoLog, t_ns: Array, values: Array) -> tuple[float, ...]:
-    """Values known at ``t_ns`` (n,), for each frame of a flight that rests, sets off and then follows the run."""
-    step_ns = float(np.median(np.diff(log.t_ns)))
-    frames = int(longest_flight_s((log.t_ns[-1] - log.t_ns[0]) * 1e-9) * 1e9 / step_ns) + 1
-    at = log.t_ns[0] + 1e9 * smooth_start(np.linspace(0.0, (frames - 1) * step_ns * 1e-9, frames), _REST_S)
-    return tuple(map(float, np.interp(at, t_ns, values)))
+def _as_flown(log: VoLog, step_s: float) -> Array:
+    """Stamps [ns] of the run at which each frame of a flight is that rests, sets off and then follows it."""
+    flight_s = longest_flight_s((log.t_ns[-1] - log.t_ns[0]) * 1e-9, _REST_S)
+    frames = int(flight_s / step_s) + 1
+    return np.asarray(log.t_ns[0] + 1e9 * smooth_start(np.linspace(0.0, (frames - 1) * step_s, frames), _REST_S))
 
 
 def _across(motion: Motion, white: Whitened) -> Array:

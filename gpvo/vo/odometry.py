@@ -22,7 +22,7 @@ from gpvo.vo.quality import (
     PairWatch,
     Verdict,
     agrees,
-    far_px,
+    disparities_px,
     judge,
     lateness_covariance,
     median_parallax_px,
@@ -225,7 +225,7 @@ class StereoOdometry:
         free = unexplained(motion, shares[0], matches, self.camera, near_px)
         second = None if free is None else self._estimate(matches, free)
         covered = (1, 0) if second is None else areas(motion, second, matches, self.camera, near_px)
-        state.meet(t_ns, far_px(matches, motion.inliers), rival=covered[1] > 0)
+        state.meet(t_ns, float(disparities_px(matches, motion.inliers, 10)[0]), rival=covered[1] > 0)
         motions = [motion]
         if second is not None and covered[1] > 0:
             state.rival = motion.inliers | second.inliers

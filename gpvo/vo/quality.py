@@ -135,9 +135,9 @@ def median_parallax_px(matches: Matches, inliers: NDArray[np.bool_]) -> float:
     return median(np.hypot(off[:, 0], off[:, 1]))
 
 
-def far_px(matches: Matches, inliers: NDArray[np.bool_]) -> float:
-    """Disparity [px] that a tenth of the inliers fall short of."""
-    return max(float(np.percentile(matches.uvd_cur[inliers, 2], 10)), KNOWN_DEPTH_PX)
+def disparities_px(matches: Matches, inliers: NDArray[np.bool_], *percentiles: float) -> Array:
+    """Disparities [px] that so many percent of the inliers fall short of."""
+    return np.maximum(np.percentile(matches.uvd_cur[inliers, 2], percentiles), KNOWN_DEPTH_PX)
 
 
 class PairWatch:
@@ -244,8 +244,7 @@ def _usual(x: Array) -> NDArray[np.bool_]:
 def motion_fields(matches: Matches, motion: Motion, camera: StereoCamera, moments: ResidualMoments) -> dict[str, Any]:
     """Fields of a :class:`gpvo.types.VoRecord` that describe the match and the solution."""
     uvd = matches.uvd_cur[motion.inliers]
-    p10 = far_px(matches, motion.inliers)
-    p50, p90 = np.maximum(np.percentile(uvd[:, 2], [50, 90]), KNOWN_DEPTH_PX)
+    p10, p50, p90 = disparities_px(matches, motion.inliers, 10, 50, 90)
     depth_m = camera.fx_px * camera.baseline_m / float(p50)
     sigma_p, sigma_m = moments.sigmas if len(uvd) >= _ENOUGH_FOR_SIGMAS else (np.nan, np.nan)
     return {
