@@ -222,7 +222,7 @@ class StereoOdometry:
         self.pair.note("held", held)
         near_px, margin_px = self._near_px, self.config.klt_window_px
         shares = [explained(motion, matches, self.camera, near_px, margin_px)]
-        free = unexplained(motion, shares[0], matches, self.camera, near_px)
+        free = unexplained(motion, shares[0], matches, self.camera, near_px, self._noise.scale_px)
         second = None if free is None else self._estimate(matches, free)
         covered = (1, 0) if second is None else areas(motion, second, matches, self.camera, near_px)
         state.meet(t_ns, float(disparities_px(matches, motion.inliers, 10)[0]), rival=covered[1] > 0)

@@ -19,7 +19,7 @@ from gpvo.geometry import se3
 from gpvo.types import Array, StereoCamera
 from gpvo.vo.config import KNOWN_DEPTH_PX
 from gpvo.vo.frontend import Matches
-from gpvo.vo.motion import Motion, predict_uvd
+from gpvo.vo.motion import Motion, predict_uvd, residual_covariance, transfer
 
 _CELLS = 96  # of the whole image
 EXPLAINED = 0.8  # share of the cells; below, a rival is looked for
@@ -264,14 +264,20 @@ def cells(uv: NDArray[np.floating[Any]], camera: StereoCamera) -> NDArray[np.int
 
 
 def unexplained(
-    motion: Motion, share: float, matches: Matches, camera: StereoCamera, near_px: float
+    motion: Motion, share: float, matches: Matches, camera: StereoCamera, near_px: float, usual_px: float
 ) -> NDArray[np.bool_] | None:
-    """(N,) the points, spare ones too, that moved otherwise, by over ``near_px``; None where the ``share`` that the
-    motion explains is most of the image."""
+    """(N,) the points, spare ones too, that moved otherwise, by over ``near_px`` and by more than their noise makes at
+    the scale ``usual_px`` of the last motions; None where the ``share`` that the motion explains is most of the
+    image."""
     if share >= EXPLAINED:
         return None
     off_px = _off_px(motion.T_prev_cur, matches, camera)
-    free = (matches.uvd_prev[:, 2] > KNOWN_DEPTH_PX) & (off_px > max(near_px, 6 * motion.scale_px))
+    allowed_px = np.full(len(off_px), max(near_px, 6 * motion.scale_px))
+    if 2 * motion.inliers.sum() > len(off_px):  # what most points contradict cannot call them noisy
+        # A compromise between two motions has larger residuals than the last motions had.
+        noise_px = 3 * min(usual_px, motion.scale_px) * _amplified(motion, matches, camera)
+        allowed_px = np.maximum(allowed_px, noise_px)
+    free = (matches.uvd_prev[:, 2] > KNOWN_DEPTH_PX) & (off_px > allowed_px)
     return free if free.sum() >= _LEAST else None
 
 
@@ -340,3 +346,12 @@ def _off_px(T_prev_cur: Array, matches: Matches, camera: StereoCamera) -> Array:
     uvd, in_front = predict_uvd(T_prev_cur, matches.uvd_prev, camera)
     off = np.linalg.norm(matches.uvd_cur - uvd.T, axis=1)
     return np.where(in_front, off, np.inf)
+
+
+def _amplified(motion: Motion, matches: Matches, camera: StereoCamera) -> Array:
+    """(N,) how many times as strong as between two frames at rest a point's noise is along its residual: where the
+    camera comes near, a small error of depth is a large one of where the motion puts it."""
+    moved, S = transfer(motion.T_prev_cur, matches.uvd_prev, camera), motion.noise.S
+    C, r = residual_covariance(moved.G, S, S, motion.noise.persistent), matches.uvd_cur.T - moved.uvd
+    at_rest, now = 2.0 * np.einsum("in,ij,jn->n", r, S, r), np.einsum("in,ijn,jn->n", r, C, r)
+    return np.sqrt(now / np.maximum(at_rest, 1e-12))

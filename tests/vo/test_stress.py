@@ -315,14 +315,14 @@ def test_a_scene_speaks_against_a_patch_with_more_points() -> None:
     assert scene_motion is not None
     config = make_config()
     near = config.ransac_threshold_px, config.klt_window_px
-    free = unexplained(motion, explained(motion, matches, CAMERA, *near), matches, CAMERA, near[0])
+    free = unexplained(motion, explained(motion, matches, CAMERA, *near), matches, CAMERA, near[0], 0.0)
     assert free is not None
     assert free[200:].mean() > 0.8
     assert not free[:200].any()
     assert areas(motion, scene_motion, matches, CAMERA, near[0])[1] > 15
     alone = Matches(before, after, np.zeros(40), 40, None, None, before)
     share = explained(scene_motion, alone, CAMERA, *near)
-    assert unexplained(scene_motion, share, alone, CAMERA, near[0]) is None
+    assert unexplained(scene_motion, share, alone, CAMERA, near[0], 0.0) is None
 
 
 def drive(count: int) -> stress.Footage:
