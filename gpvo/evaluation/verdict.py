@@ -8,6 +8,7 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING, Literal
 
 import numpy as np
+from numpy.typing import NDArray
 
 from gpvo.dataset.check import ENOUGH_INSIDE
 from gpvo.dataset.errors import (
@@ -21,6 +22,7 @@ from gpvo.dataset.misread import GROSS_DEG, FixedRotation, Resemblance
 from gpvo.dataset.truth_noise import made_from_odometry
 from gpvo.evaluation.consistency import BY_MODEL, Consistency, Horizon
 from gpvo.online.features import AXES
+from gpvo.online.slip import flag_slips
 from gpvo.stats.consistency import seen_axes
 from gpvo.types import Array, Status, StereoCamera
 
@@ -350,12 +352,21 @@ def _of_truth_and_path(e: Evaluation) -> Iterator[str]:
             f"The ground truth runs in straight pieces of {every} poses: it was interpolated, and looks more exact than"
             " it is. Give the poses as they were measured."
         )
-    own, true = (T[e.covered, :3, 3] for T in (e.T_est, e.T_true))
-    size, true_size = (float(np.sqrt(((p - p.mean(axis=0)) ** 2).sum(axis=1).mean())) for p in (own, true))
+    # Of each piece that no lost motion breaks: a log that starts again, at its origin, is no smaller for it.
+    log = flag_slips(e.run.log)
+    piece = np.cumsum(~log.usable & log.column("is_reference"))[e.covered]
+    size, true_size = (_extent(T[e.covered, :3, 3], piece) for T in (e.T_est, e.T_true))
     is_told = e.turned is not None and e.turned.scale != 1.0
     is_one_path = e.inverse is None and not is_told and not _are_strangers(e)
     if is_one_path and true_size > _LEAST_PATH_M and not 1 / _MOST_SCALE < size / true_size < _MOST_SCALE:
         yield _of_size("path is", size / true_size, e.run.log.camera)
+
+
+def _extent(p: Array, piece: NDArray[np.int64]) -> float:
+    """Rms distance [m] of positions (n, 3) from the mean of their ``piece`` (n,)."""
+    _, of, count = np.unique(piece, return_inverse=True, return_counts=True)
+    mean = np.stack([np.bincount(of, axis) / count for axis in p.T], axis=1)
+    return float(np.sqrt(((p - mean[of]) ** 2).sum(axis=1).mean()))
 
 
 def _up_to(sigma: Array) -> str:

@@ -192,6 +192,16 @@ def test_another_unit_is_named(factor: float, told: bool) -> None:
     assert any("1.11 times as large as the truth's: a wrong baseline" in line for line in lines) == (factor == 0.9)
 
 
+def test_a_log_that_starts_again_at_its_origin_is_not_in_another_unit() -> None:
+    log, truth = make_run(600)
+    poses = log.trajectory()
+    again = [replace(r, T_prev_cur=se3.inverse(poses[k - 1])) if k == 300 else r for k, r in enumerate(log)]
+    run = Run(Path("hall"), "hall", replace(log, records=again), truth, None, Mounting(), [])
+    lines = verdict(evaluate_run(run)).lines
+    assert any("In 1 of 600 motions" in line for line in lines)
+    assert not any("in metres?" in line for line in lines), lines
+
+
 def test_odometry_propagated_between_corrections_is_told_from_a_truth_that_was_made_of_it() -> None:
     log, truth = make_run(600, v_t=False)
     exact = se3.inverse(truth.T_world_cam[:-1]) @ truth.T_world_cam[1:]
