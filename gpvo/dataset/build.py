@@ -14,7 +14,13 @@ from numpy.typing import NDArray
 
 from gpvo.dataset.clock import estimate_time_offset, on_clock_of_log
 from gpvo.dataset.doubtful import false_motions, in_waits, odd_stretches
-from gpvo.dataset.errors import motion_targets, position_targets, require_attitude
+from gpvo.dataset.errors import (
+    MAX_GAP_S,
+    motion_targets,
+    position_targets,
+    require_attitude,
+    steps_of_slow_truth,
+)
 from gpvo.dataset.hand_eye import align_frames, windowed_motions
 from gpvo.dataset.noiseless import without_noise
 from gpvo.dataset.truth_noise import TruthNoise, of_stamps
@@ -160,13 +166,7 @@ def build(
     is_odd = known & in_waits(seen, [s.t_ns for s in odd_stretches(log, truth)])
     if odd == "drop":
         known &= ~is_odd
-    if known.sum() < MIN_ROWS:
-        what = f"only {int(known.sum())} of {max(len(log) - 1, 0)} motions have ground truth, {MIN_ROWS} are needed"
-        cure = "check that log and truth share one clock"
-        if (measured := int(seen.usable.sum())) < MIN_ROWS:
-            what = f"only {measured} of {max(len(log) - 1, 0)} motions were measured, {MIN_ROWS} are needed"
-            cure = "give a longer sequence, or one in which odometry is lost less often"
-        raise GpvoError(what, where=where or name, cure=cure)
+    _require_rows(int(known.sum()), seen, log, truth, where or name)
     kept = seen.rows(known)
     n_lost, slips, jumps = lost_of(log)
     as_if, has = motion_targets([replace(r, status=Status.OK) for r in slips], truth)
@@ -194,6 +194,24 @@ def build(
         told=told[known] if told is not None and noise else None,
         truth_noise=of_stamps(noise, log, truth, kept.column("t_prev_ns"), kept.t_ns) if noise else None,
     )
+
+
+def _require_rows(known: int, seen: VoLog, log: VoLog, truth: TruthLog, where: object) -> None:
+    """Raise GpvoError, naming ``where``, for too few motions with truth, ``known``, of those ``seen`` in the log."""
+    if known >= MIN_ROWS:
+        return
+    what = f"only {known} of {max(len(log) - 1, 0)} motions have ground truth"
+    inside = int(((log.t_ns >= truth.t_ns[0]) & (log.t_ns <= truth.t_ns[-1])).sum())
+    if (measured := int(seen.usable.sum())) < MIN_ROWS:
+        what = f"only {measured} of {max(len(log) - 1, 0)} motions were measured"
+        cure = "give a longer sequence, or one in which odometry is lost less often"
+    elif inside >= MIN_ROWS and (steps_s := steps_of_slow_truth(truth, log.t_ns)) and steps_s[0] > MAX_GAP_S:
+        cure = (
+            f"the truth's poses come every {steps_s[0]:.2g} s: give one whose poses are at most {MAX_GAP_S:g} s apart"
+        )
+    else:
+        cure = "check that log and truth share one clock"
+    raise GpvoError(f"{what}, {MIN_ROWS} are needed", where=where, cure=cure)
 
 
 _MOST_SCALE = 3.0  # less than a metre has feet

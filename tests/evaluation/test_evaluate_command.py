@@ -362,6 +362,17 @@ def test_an_offset_that_nothing_tells_names_the_run(tmp_path):
         assert "short: the log lasts 2.00 s" in err
 
 
+@pytest.mark.parametrize("late_s,cure", [(0, "every 1.1 s: give one whose poses are at most 0.5 s"), (99, "one clock")])
+def test_a_truth_too_slow_to_learn_from_is_told_from_one_of_another_clock(tmp_path, late_s, cure):
+    log, truth = make_run(200)
+    slow = replace(truth, t_ns=truth.t_ns[::22] + 10**7 + late_s * 10**9, T_world_cam=truth.T_world_cam[::22])
+    write_run(tmp_path / "run", log, truth=slow)
+    code, out, err = gpvo("train", tmp_path / "run", "-o", tmp_path / "m.gpvo")
+    assert (code, out, len(err.splitlines())) == (2, "", 1)
+    assert "only 0 of 200 motions have ground truth" in err
+    assert cure in err
+
+
 @pytest.mark.parametrize("lost", [False, True], ids=["short", "lost throughout"])
 def test_what_no_run_so_short_or_lost_can_tell_is_said_of_it(tmp_path, lost):
     log, truth = make_run(200 if lost else 12, lost=set(range(1, 201)) if lost else set())
