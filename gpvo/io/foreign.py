@@ -235,12 +235,12 @@ def _from_table(path: Path, table: Table, covariance_of: str, axes: str, complet
 
 
 def _unused(table: Table, covariance: Array | None) -> tuple[str, ...]:
-    """A remark on columns that state an uncertainty and that nothing reads."""
+    """A remark on columns that state an uncertainty, or a feature, and that nothing reads."""
     notes = []
     if table.unused:
         more = f" and {len(table.unused) - _NAMED} more" if len(table.unused) > _NAMED else ""
         named = ", ".join(table.unused[:_NAMED]) + more
-        notes.append(f"columns not used: {named}; --map COLUMN=cov_00 takes a variance, see --help")
+        notes.append(f"columns not used: {named}; --map COLUMN=NAME takes a variance (cov_00) or a count (n_inliers)")
     if covariance is None and any(c.startswith("cov_") for c in table.columns):
         absent = ", ".join(f"cov_{i}{i}" for i in range(6) if f"cov_{i}{i}" not in table.columns)
         notes.append(f"the covariance is not used: it has no {absent}; --map COLUMN=NAME names them")

@@ -76,7 +76,11 @@ _LENGTHS_M = {"m": 1.0, "mm": 1e-3, "cm": 1e-2, "km": 1e3, "ft": 0.3048}
 _ANGLES_RAD = {"rad": 1.0, "mrad": 1e-3, "deg": np.pi / 180}
 # In brackets, or behind an underscore; of a variance, squared or not.
 _UNIT = re.compile(rf"(?:[\[(] *|_)({'|'.join((*_LENGTHS_M, *_ANGLES_RAD))})(?:\^?2|²)?(?: *[\])])?$")
-_UNCERTAIN = re.compile(r"cov|var|sigma|std|^p_?\d\d$", re.IGNORECASE)
+# What tells how wrong a motion may be: an uncertainty, or what odometry counts and sees.
+_TELLING = re.compile(
+    r"cov|var|sigma|std|^p_?\d\d$|inlier|feature|tracked|match|landmark|keypoint|reproj|disparity|bright|contrast|sharp",
+    re.IGNORECASE,
+)
 
 
 @dataclass(frozen=True)
@@ -87,7 +91,7 @@ class Table:
     t_ns: NDArray[np.int64]
     columns: dict[str, Array]
     lines: list[int]
-    unused: tuple[str, ...] = ()  # columns that look like an uncertainty and were not understood
+    unused: tuple[str, ...] = ()  # columns that look like an uncertainty or a feature and were not understood
     notes: tuple[str, ...] = ()
     covariance_axes: str = "world"
 
@@ -146,7 +150,7 @@ def read_table(path: Path, mapping: Mapping[str, str]) -> Table:
         check_padding(texts, path)
     check_interval(stamps, path, lambda unit: _unit_cure(column, unit), is_stated=is_stated)
     data = np.array(rows, dtype=np.float64)
-    unused = tuple(c for k, c in enumerate(header) if k not in targets.values() and _UNCERTAIN.search(c))
+    unused = tuple(c for k, c in enumerate(header) if k not in targets.values() and _TELLING.search(c))
     columns = {n: data[:, i] * _to_si(header[targets[n]], n) for i, n in enumerate(order)}
     axes = "mixed" if "cov_33" in targets and _plain(header[targets["cov_33"]]) in _OPENVINS else "world"
     notes = (*(() if top else (NO_HEADER,)), *_units_apart({n: header[targets[n]] for n in order}))

@@ -237,8 +237,10 @@ def test_tum_lines_with_decimal_commas_are_named_as_such(read: Callable[[Path], 
         read(path)
 
 
-@pytest.mark.parametrize("names", ["P11,P22,P66", "p_00,p_11", "sigma_x,sigma_y"])
-def test_an_uncertainty_that_nothing_reads_is_named(names: str, tmp_path: Path) -> None:
+@pytest.mark.parametrize(
+    "names", ["P11,P22,P66", "p_00,p_11", "sigma_x,sigma_y", "num_inliers,feature_count", "mean_brightness"]
+)
+def test_an_uncertainty_or_a_feature_that_nothing_reads_is_named(names: str, tmp_path: Path) -> None:
     path = tmp_path / "log.csv"
     more = ",0.01" * len(names.split(","))
     path.write_text(f"{HEAD},{names}\n0.0,{POSE}{more}\n0.1,{POSE}{more}\n")
