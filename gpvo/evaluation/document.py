@@ -34,7 +34,7 @@ def document(evaluations: Sequence[Evaluation]) -> dict[str, Any]:
       the truth jumps; they count only in ATE, final error and RPE.
     * ``odd_stretches``: motions, in words, in which odometry and truth differ far more than elsewhere; scored,
       unless they are jumps of the truth.
-    * ``in_domain``: share of the frames in the model's training domain.
+    * ``in_domain``: share of the measured motions in the model's training domain.
     * ``poses`` {``count``, ``position``, ``orientation``, ``joint``}: NEES of the pose covariances that a filter's log
       states (see :class:`gpvo.evaluation.trajectory.PoseConsistency`); None where it states none.
     * ``verdict`` {``colour``, ``headline``, ``lines``, ``judged``}: what the numbers amount to, in words; ``judged``:

@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 from evaluation_runs import make_run, stated_covariance
 from gpvo.dataset.build import build
+from gpvo.dataset.check import check
 from gpvo.errors import ModelError
 from gpvo.evaluation.document import document
 from gpvo.evaluation.evaluate import EvaluateOptions, evaluate_run
@@ -360,6 +361,17 @@ def test_an_offset_that_nothing_tells_names_the_run(tmp_path):
         code, out, err = gpvo(*command, tmp_path / "short", "--time-offset", "auto")
         assert (code, out, len(err.splitlines())) == (2, "", 1)
         assert "short: the log lasts 2.00 s" in err
+
+
+def test_motions_that_are_lost_lie_in_no_domain_and_outside_none():
+    """The share is that of gpvo check, however often odometry is lost."""
+    log, truth = synthetic_run(9, n=300)
+    blind = [replace(r, status=Status.LOST, T_prev_cur=np.eye(4)) if k % 10 < 4 else r for k, r in enumerate(log)]
+    run = Run(Path("hall"), "hall", replace(log, records=blind), truth, None, Mounting(), [])
+    predictor = small_model().predictor()
+    found = check(predictor, run)
+    assert found.in_domain > 0.8
+    assert evaluate_run(run, predictor).in_domain == pytest.approx(found.in_domain, abs=1e-9)
 
 
 @pytest.mark.parametrize("late_s,cure", [(0, "every 1.1 s: give one whose poses are at most 0.5 s"), (99, "one clock")])
