@@ -10,11 +10,10 @@ relative error s of its focal length and a shift (c, e) of its centre displace a
 term, and terms of higher order: a centre shifted under distortion of second and fourth order displaces the image by
 polynomials of that order (D. Brown, "Decentering distortion of lenses", 1966). So the coefficients of both fourth-order
 polynomials are free, but for the x term of the rows, which no lens makes: it shows a turn about the optical axis. Turns
-are a part of the prior covariance. A Kalman filter of constant state estimates them:
-dx from the residuals of each motion, with the motion as an unknown without a prior, and dy from the rows, which need no
-motion. What cannot be told apart from motion: the depth's scale. One more coefficient is the time by which the right
-image is later than the left one: it displaces a point by its velocity in that image, which the motion and its depth
-tell.
+are a part of the prior covariance. A Kalman filter of constant state estimates them: dx from the residuals of each
+motion, with the motion as an unknown without a prior, and dy from the rows, which need no motion. What cannot be told
+apart from motion: the depth's scale. One more coefficient is the time by which the right image is later than the left
+one: it displaces a point by its velocity in that image, which the motion and its depth tell.
 
 Three things keep it honest. Errors of neighbouring frames are alike (a feature is off in the same way for as long as it
 is tracked): blocks of frames are compared with their expected scatter, and all information is divided by
@@ -137,7 +136,7 @@ class RigError:
     """
 
     def __init__(self, camera: StereoCamera, known: RigState | None = None, *, learn: bool = True) -> None:
-        self._camera, self.moved, self.twist = camera, 0, NO_TWIST
+        self._camera, self._displaced, self.moved, self.twist = camera, False, 0, NO_TWIST
         self.state = known or RigState.prior(camera)
         # What is right beyond doubt stays so.
         self._learn = learn and bool(self.state.covariance.any())
@@ -232,7 +231,7 @@ class RigError:
         B = np.column_stack([B.transpose(0, 2, 1).reshape(-1, _N), (z * root).reshape(-1)])
         K = np.linalg.solve(A.T @ A, A.T @ B[:, :-1])
         added: Array = K @ self.state.covariance[_IN_DX] @ K.T
-        if self._learn:
+        if self._learn and self._lasts(displaced is not None):
             self._undisputed = 0 if disputed else self._undisputed + 1
             sigma_px = motion.scale_px * np.sqrt(1.0 + motion.noise.persistent)
             near = motion.uvd_prev[:, 2] > min_disparity_px + _NEAR * sigma_px
@@ -270,9 +269,14 @@ class RigError:
 
     def update_rows(self, uvd: Array, row_error: Array) -> None:
         """Learn from rows (M,) at measurements (M, 3) alone: those of a pair whose rows leave no motion to be found."""
-        if self._learn:
+        if self._learn and self._lasts(True):
             self._learn_rows(self._terms(uvd, self.twist)[1], row_error)
             self._conclude()
+
+    def _lasts(self, displaced: bool) -> bool:
+        """Whether this pair tells of the cameras: rows that one alone displaces were lost on their way."""
+        before, self._displaced = self._displaced, displaced
+        return before or not displaced
 
     def _look_back(self) -> None:
         """If the cameras were turned against one another, forget how they stood, and nothing else."""

@@ -195,6 +195,17 @@ def test_a_knock_in_flight_is_forgotten_and_named(degrees: tuple[float, float, f
     assert "a frame apart" not in findings
 
 
+def test_one_displaced_pair_moves_no_camera(footage: stress.Footage) -> None:
+    """The right image of pair 12 lost its first six rows on the way: the next five pairs were lost, too, as the cameras
+    were taken to have moved, and to have moved back."""
+    frames = list(footage.frames)
+    frames[12] = replace(frames[12], right=np.roll(frames[12].right, -6, axis=0))
+    outcome = stress.run(replace(footage, frames=frames))
+    assert [r.status for r in outcome.records[1:12] + outcome.records[13:]] == [Status.OK] * 22
+    assert outcome.silent == []
+    assert not any("moved" in reason for reason in outcome.reasons)
+
+
 def test_a_turn_about_the_optical_axis_is_no_delay() -> None:
     """A right camera that is turned by 0.8 degrees from the start: where both roll, too, its rows looked late."""
     clip = render_clip(pinhole(480, 360), wander(30, speed_mps=1.6, seed=5))
