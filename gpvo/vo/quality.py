@@ -145,7 +145,8 @@ class PairWatch:
 
     ``late``: by how many frames the right image is older than the left one, 0 where nothing speaks for it.
     ``unsharp``: whether disparities of the last pair are not to be learned from: one image was far more blurred than
-    the other, so that the search on the right stops near where it began, or rows were of two moments.
+    the other, so that the search on the right stops near where it began, rows were of two moments, or the right image
+    was that of the frame before.
     """
 
     def __init__(self, camera: StereoCamera) -> None:
@@ -167,7 +168,7 @@ class PairWatch:
         self._seen["blur"] += blurred
         self._seen["woven"] += seen.woven
         woven, self._woven = seen.woven or self._woven, seen.woven
-        self.unsharp = blurred or woven
+        self.unsharp = blurred or woven or seen.right_repeated
         doubts = ["every second row is of another moment"] if woven else []
         if blurred:
             side, times = ("right", seen.right_blur) if seen.right_blur > 1.0 else ("left", 1.0 / seen.right_blur)
@@ -175,7 +176,7 @@ class PairWatch:
         if self._half_size:
             self._seen["size"] += 1
             doubts.append("the principal point lies in the corner of the image")
-        if right is None:
+        if right is None or seen.right_repeated:  # rows of an older image say nothing of the next one
             return doubts
         self.late = self._lateness(right)
         if self.late:

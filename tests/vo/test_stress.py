@@ -104,6 +104,13 @@ def test_a_bonnet_neither_biases_the_motion_nor_goes_unnamed(footage: stress.Foo
     assert any("mask what is fixed to the camera" in finding for finding in odometry.pair.findings())
 
 
+def test_a_frozen_right_image_says_nothing_of_the_cameras(footage: stress.Footage) -> None:
+    """Ten frames long. Its rows were taken for a knock and for a delay, which the motions after it had to bear."""
+    changed = stress.run(stress.frozen_right(footage))
+    assert [r.status for r in changed.records[10:]] == [Status.LOST] * 10 + [Status.OK] * 4
+    assert changed.error_m[20:].max() < 0.1 * changed.moved_m[20:].min()
+
+
 def test_interlaced_images_are_doubted_and_do_not_outlast_themselves(footage: stress.Footage) -> None:
     """Twelve at the start were taken for a wrong rig: the good motions after them were wrong by 76 % (median)."""
     clip = render_clip(pinhole(480, 360), wander(24, speed_mps=1.6, seed=5))
