@@ -20,8 +20,8 @@ from gpvo.vo import opencv
 from gpvo.vo.config import KNOWN_DEPTH_PX, VoConfig
 from gpvo.vo.frontend import EMPTY, Matches, Observation, RightSearch
 from gpvo.vo.motion import transfer
-from gpvo.vo.opencv import Image, Light, Points, image_stats, in_light_of
-from gpvo.vo.patches import Patches, align, cut
+from gpvo.vo.opencv import Image, ImageStats, Light, Points, image_stats, in_light_of
+from gpvo.vo.patches import Patches, align, cut, stands_out
 from gpvo.vo.rig_error import RigError
 from gpvo.vo.rivals import cells
 
@@ -72,6 +72,7 @@ class _View:
     half_left: Image
     half_right: Image
     light_left: Light
+    stats: ImageStats
     right_as_left: Image  # the right image in the left's light
     seen: _Seen  # usable as reference
     survey: Future[_Survey] | None = None  # once begun
@@ -141,14 +142,15 @@ class KltFrontend:
         half_left, half_right = opencv.halve(frame.left), opencv.halve(frame.right)
         light_left, light_right = Light.of(half_left), Light.of(half_right)
         right = in_light_of(frame.right, light_right, light_left)
-        self._current = _View(frame.left, frame.right, half_left, half_right, light_left, right, self._nothing)
+        stats = image_stats(frame.left, light_left)
+        self._current = _View(frame.left, frame.right, half_left, half_right, light_left, stats, right, self._nothing)
         self._new = None
         if not stays:
             self._begin_survey(self._current)  # beside what comes first
         same_left = before is not None and _equal(before.half_left, half_left, before.left, frame.left)
         same_right = before is not None and _equal(before.half_right, half_right, before.right, frame.right)
         return Observation(
-            image_stats(frame.left, light_left),
+            stats,
             same_right and same_left,
             same_right and not same_left,
             light_left.ratio(light_right),
@@ -176,7 +178,7 @@ class KltFrontend:
             both.row_error[:n][good],
             int(followed[: reference.strong].sum()),
             spare=(np.flatnonzero(found) >= reference.strong)[good],
-            right=self._right_search(both, uv[:, 1] - before.left_uv[:, 1]),
+            right=self._right_search(current, both, uv[:, 1] - before.left_uv[:, 1]),
             sought_uvd=reference.seen.uvd,
             displaced=self._displaced(both),
         )
@@ -319,7 +321,7 @@ class KltFrontend:
         seen = _Seen(uv_left, uvd, (1.0, 0.0) - near.A[:, 0], patches)
         return _Found(seen, good, np.where(found, row_error, np.nan), good | (guess[:, 0] >= 0))
 
-    def _right_search(self, both: _Found, row_motion: Array) -> RightSearch:
+    def _right_search(self, view: _View, both: _Found, row_motion: Array) -> RightSearch:
         """What the search in the right image came to; the first points were followed and have moved down so far."""
         uvd, n = both.seen.uvd, len(row_motion)
         d_expected, row_expected = self._rig_error.errors(uvd)
@@ -327,6 +329,8 @@ class KltFrontend:
         # A pair that is off by the same rows everywhere is still a pair: its rows are counted from there.
         usual = float(np.median(row_error[np.isfinite(row_error)])) if np.isfinite(row_error).any() else 0.0
         off_row = both.inside & (np.abs(row_error - usual) > self._config.max_row_error_px)
+        # Nor would noise be found, were it a pair.
+        sought = both.inside & (np.isfinite(row_error) | stands_out(both.seen.patches, 255 * view.stats.noise_level))
         least_px = self._config.min_disparity_px
         known = both.inside & np.isfinite(row_error)
         behind = known & ~off_row & (disparity < min(least_px, -KNOWN_DEPTH_PX))
@@ -334,7 +338,7 @@ class KltFrontend:
         far = known & ~behind & (disparity < max(least_px, KNOWN_DEPTH_PX))
         seen = np.abs(row_error[:n]) < self._config.klt_window_px
         return RightSearch(
-            int((both.inside & ~far).sum()),
+            int((sought & ~far).sum()),
             int((both.good & ~off_row & ~far & ~behind).sum()),
             int(behind.sum()),
             int(off_row.sum()),
@@ -359,7 +363,7 @@ class KltFrontend:
         good = before.good & now.good[:n]
         self._matched = now.seen[:n][good]
         # Wrong pairs are no second motion: nothing is said of points sought in vain, nor of how rows move.
-        right = self._right_search(now, np.empty(0))
+        right = self._right_search(current, now, np.empty(0))
         uvd, displaced = self._matched.uvd, self._displaced(now)
         return Matches(before.seen.uvd[good], uvd, now.row_error[:n][good], n, right=right, displaced=displaced)
 

@@ -69,6 +69,12 @@ def cut(image: Image, uv: Points, window_px: int) -> Patches:
     return patches
 
 
+def stands_out(patches: Patches, noise: float) -> NDArray[np.bool_]:
+    """(N,) which patches (N, 3, M), as of :func:`cut`, would look alike in another image with as much noise, of this
+    standard deviation [grey values]."""
+    return np.asarray(2 * noise**2 < _ALIKE**2 * np.square(patches[:, 0]).mean(axis=1))
+
+
 def align(patches: Patches, image: Image, start: Points, A: Array, h: Array | None = None) -> Aligned:
     """Patches (N, 3, M), as of :func:`cut`, found in another image near ``start`` (N, 2), deformed by ``A`` (N, 2, 2).
 

@@ -111,6 +111,19 @@ def test_a_frozen_right_image_says_nothing_of_the_cameras(footage: stress.Footag
     assert changed.error_m[20:].max() < 0.1 * changed.moved_m[20:].min()
 
 
+def test_corners_of_noise_speak_against_no_pair(footage: stress.Footage) -> None:
+    """A night of 15 grey values: each motion was in doubt, as the right image does not show the left one's noise."""
+
+    def darken(image: np.ndarray) -> np.ndarray:
+        return np.asarray(np.clip(np.rint(0.06 * image + rng.normal(0, 2, image.shape)), 0, 255), np.uint8)
+
+    rng = np.random.default_rng(0)
+    frames = [replace(f, left=darken(f.left), right=darken(f.right)) for f in footage.frames]
+    outcome = stress.run(replace(footage, frames=frames))
+    assert not any("right image" in reason for reason in outcome.reasons)
+    assert outcome.silent == []
+
+
 def test_interlaced_images_are_doubted_and_do_not_outlast_themselves(footage: stress.Footage) -> None:
     """Twelve at the start were taken for a wrong rig: the good motions after them were wrong by 76 % (median)."""
     clip = render_clip(pinhole(480, 360), wander(24, speed_mps=1.6, seed=5))
