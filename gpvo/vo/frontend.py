@@ -17,25 +17,49 @@ from numpy.typing import NDArray
 from gpvo.types import Array, StereoCamera, StereoFrame, StereoTracks, TrackFrame, VoRecord
 from gpvo.vo import opencv
 from gpvo.vo.config import VoConfig
-from gpvo.vo.opencv import ImageStats, Light, Points, image_stats
+from gpvo.vo.opencv import Image, ImageStats, Light, Points, image_stats
 from gpvo.vo.rig_error import RigError
+
+_PART = 1 / 8  # of an image's rows
 
 
 @dataclass(frozen=True)
 class Observation:
     """What is known about a frame before its motion is.
 
-    ``repeated``, ``right_repeated``: the pair, or its right image alone, is identical to that of the previous frame.
+    ``repeated``: the pair is identical to that of the previous frame; ``alone``: or which of its images is, ``left`` or
+    ``right``; ``partly``: or an eighth or more of the rows of one are, as they were not a frame ago.
     ``right_light``: by what factor the right image is brighter or has more contrast; 1 if they are alike.
     ``right_blur``: by what factor it is more blurred. ``woven``: every second row of one is of another moment.
     """
 
     stats: ImageStats | None
     repeated: bool
-    right_repeated: bool = False
+    alone: str = ""
     right_light: float = 1.0
     right_blur: float = 1.0
     woven: bool = False
+    partly: bool = False
+
+
+class Repeats:
+    """What of each frame was in the one before: an image, or rows of it, where a buffer was not filled in time. Noise
+    makes it impossible that a camera sees the same twice."""
+
+    def __init__(self) -> None:
+        self._images: tuple[Image, Image] | None = None
+        self._rows = [np.zeros(1, bool)] * 2
+
+    def step(self, left: Image, right: Image) -> dict[str, Any]:
+        """Fields of the frame's :class:`Observation`. Rows that repeat time and again are of a caption."""
+        before, self._images = self._images, (left, right)
+        if before is None:
+            return {"repeated": False}
+        equal, rows = zip(*map(opencv.same_rows, self._images, before), strict=True)
+        partly = any((now & ~was).mean() >= _PART for now, was in zip(rows, self._rows, strict=True))
+        self._rows = list(rows)
+        alone = "" if equal[0] == equal[1] else "left" if equal[0] else "right"
+        return {"repeated": all(equal), "alone": alone, "partly": partly and not any(equal)}
 
 
 @dataclass(frozen=True)
@@ -195,13 +219,12 @@ class DescriptorFrontend(_AfreshFrontend):
     ) -> None:
         self._camera, self._rig_error, self._config = camera, rig_error, config
         self._mask = opencv.as_mask(mask)
-        self._images: tuple[opencv.Image, opencv.Image] | None = None
+        self._repeats = Repeats()
         self._pool = ThreadPoolExecutor(1)
 
     def observe(self, frame: StereoFrame | TrackFrame, *, stays: bool = False) -> Observation:
         """Detect, describe and match left to right."""
         assert isinstance(frame, StereoFrame)
-        before, self._images = self._images, (frame.left, frame.right)
         right = self._pool.submit(self._features, frame.right)
         uv_left, bits = self._features(frame.left)
         uv_right, bits_right = right.result()
@@ -212,9 +235,8 @@ class DescriptorFrontend(_AfreshFrontend):
         good = self._rig_error.allows(uvd, row_error, config.min_disparity_px, most_px, rows_px)
         displaced = self._rig_error.displaced(uvd, row_error, rows_px)
         self._current = _Measured(uvd[good], row_error[good], bits[i][good], len(uv_left), displaced)
-        left_same, right_same = (before is not None and np.array_equal(before[k], self._images[k]) for k in range(2))
         stats = image_stats(frame.left, Light.of(opencv.halve(frame.left)))
-        return Observation(stats, left_same and right_same, right_same and not left_same)
+        return Observation(stats, **self._repeats.step(frame.left, frame.right))
 
     def _pairs(self, before: NDArray[Any], now: NDArray[Any]) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
         i, j = opencv.match_mutual(before, now).T

@@ -18,7 +18,7 @@ from gpvo.geometry import se3
 from gpvo.types import Array, StereoCamera, StereoFrame, TrackFrame
 from gpvo.vo import opencv
 from gpvo.vo.config import KNOWN_DEPTH_PX, VoConfig
-from gpvo.vo.frontend import EMPTY, Matches, Observation, RightSearch
+from gpvo.vo.frontend import EMPTY, Matches, Observation, Repeats, RightSearch
 from gpvo.vo.motion import transfer
 from gpvo.vo.opencv import Image, ImageStats, Light, Points, image_stats, in_light_of
 from gpvo.vo.patches import Patches, align, cut, stands_out
@@ -110,11 +110,6 @@ class _New:
         return cls(detected, seen[good], int(good[:detected].sum()))
 
 
-def _equal(half_a: Image, half_b: Image, a: Image, b: Image) -> bool:
-    """Whether two images are equal; comparing the small ones first leaves the costly comparison to repetitions."""
-    return np.array_equal(half_a, half_b) and np.array_equal(a, b)
-
-
 class KltFrontend:
     """See the module's text. One instance per run; not for use from several threads at once."""
 
@@ -133,12 +128,12 @@ class KltFrontend:
         self._nothing = _Seen(np.empty((0, 2), np.float32), np.empty((0, 3)), np.empty((0, 2)), no_patches)
         self._new: _New | None = None
         self._matched = self._nothing
+        self._repeats = Repeats()
         self._pool = ThreadPoolExecutor(1)
 
     def observe(self, frame: StereoFrame | TrackFrame, *, stays: bool = False) -> Observation:
         """Take in a rectified pair."""
         assert isinstance(frame, StereoFrame)
-        before = self._current
         half_left, half_right = opencv.halve(frame.left), opencv.halve(frame.right)
         light_left, light_right = Light.of(half_left), Light.of(half_right)
         right = in_light_of(frame.right, light_right, light_left)
@@ -147,15 +142,12 @@ class KltFrontend:
         self._new = None
         if not stays:
             self._begin_survey(self._current)  # beside what comes first
-        same_left = before is not None and _equal(before.half_left, half_left, before.left, frame.left)
-        same_right = before is not None and _equal(before.half_right, half_right, before.right, frame.right)
         return Observation(
             stats,
-            same_right and same_left,
-            same_right and not same_left,
-            light_left.ratio(light_right),
-            light_left.blur(light_right),
-            opencv.woven(frame.left) or opencv.woven(frame.right),
+            right_light=light_left.ratio(light_right),
+            right_blur=light_left.blur(light_right),
+            woven=opencv.woven(frame.left) or opencv.woven(frame.right),
+            **self._repeats.step(frame.left, frame.right),
         )
 
     def match(self, T_prev_cur_guess: Array, *, from_scratch: bool = False) -> Matches:

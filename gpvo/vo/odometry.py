@@ -109,6 +109,7 @@ class StereoOdometry:
         matches, motion = self._solve(guess, clock)
         doubts = self.pair.step(seen, matches.right)
         frozen, choice = self._state.frozen(seen), Choice()
+        self.pair.note("partly", bool(frozen) and seen.partly)
         if not frozen:  # what stands still in a repeated image says nothing of the vehicle
             motion, choice = self._choose(matches, motion, frame.t_ns, doubts)
         matches, motion = self._freed(matches, motion, frame.t_ns)

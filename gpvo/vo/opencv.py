@@ -205,6 +205,15 @@ def woven(image: NDArray[np.uint8]) -> bool:
     return comb(image) > _WOVEN and comb(np.ascontiguousarray(image[: len(image) // 8].T)) < 1.0
 
 
+def same_rows(image: NDArray[np.uint8], before: NDArray[np.uint8]) -> tuple[bool, NDArray[np.bool_]]:
+    """Whether two images are equal, and (H,) which of their rows are, and hold a picture."""
+    same = (image[:, ::8] == before[:, ::8]).all(axis=1)
+    same[same] = (image[same] == before[same]).all(axis=1)
+    equal = bool(same.all())
+    same[same] = image[same].std(axis=1) > _NO_PICTURE
+    return equal, same
+
+
 def in_light_of(image: NDArray[np.uint8], own: Light, other: Light) -> NDArray[np.uint8]:
     """The image with the other's distribution of grey values where their light differs, else the image itself.
 

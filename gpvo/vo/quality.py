@@ -31,7 +31,8 @@ _LATE = 0.25  # frames between left and right
 _RIG_PX = 1.0  # by which a wrong rig displaces rows at most, a shift of all apart (a focal length that is 1 % off)
 
 _CURES = {
-    "frozen": "the right image repeats itself while the left one changes; look at the right camera's driver",
+    "frozen": "one image repeats itself while the other changes; look at its camera's driver",
+    "partly": "a part of an image is that of the frame before; look at the driver, its buffers, and the decoder",
     "late": "left and right are a frame apart; pair them by time stamp, or trigger both cameras together",
     "swapped": "most points lie behind the cameras; exchange left and right",
     "rows": "most points are in a different row on the right; calibrate the pair again",
@@ -145,8 +146,8 @@ class PairWatch:
 
     ``late``: by how many frames the right image is older than the left one, 0 where nothing speaks for it.
     ``unsharp``: whether disparities of the last pair are not to be learned from: one image was far more blurred than
-    the other, so that the search on the right stops near where it began, rows were of two moments, or the right image
-    was that of the frame before.
+    the other, so that the search on the right stops near where it began, rows were of two moments, or an image, or a
+    part of one, was that of the frame before.
     """
 
     def __init__(self, camera: StereoCamera) -> None:
@@ -162,13 +163,13 @@ class PairWatch:
     def step(self, seen: Observation, right: RightSearch | None) -> list[str]:
         """What is doubtful about this pair, in words; empty for a good one."""
         self._frames += 1
-        self._seen["frozen"] += seen.right_repeated
+        self._seen["frozen"] += bool(seen.alone)
         self._seen["light"] += not 1 / _DARKER < seen.right_light < _DARKER
         blurred = not 1 / _BLURRED < seen.right_blur < _BLURRED
         self._seen["blur"] += blurred
         self._seen["woven"] += seen.woven
         woven, self._woven = seen.woven or self._woven, seen.woven
-        self.unsharp = blurred or woven or seen.right_repeated
+        self.unsharp = blurred or woven or bool(seen.alone) or seen.partly
         doubts = ["every second row is of another moment"] if woven else []
         if blurred:
             side, times = ("right", seen.right_blur) if seen.right_blur > 1.0 else ("left", 1.0 / seen.right_blur)
@@ -176,7 +177,7 @@ class PairWatch:
         if self._half_size:
             self._seen["size"] += 1
             doubts.append("the principal point lies in the corner of the image")
-        if right is None or seen.right_repeated:  # rows of an older image say nothing of the next one
+        if right is None or seen.alone:  # rows of an older image say nothing of the next one
             return doubts
         self.late = self._lateness(right)
         if self.late:

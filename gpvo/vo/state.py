@@ -99,9 +99,11 @@ class State:
 
     def frozen(self, seen: Observation) -> str:
         """What repeats although the camera was moving; empty if nothing does."""
-        if seen.right_repeated:
-            return "frozen right image"
-        return "frozen image" if seen.repeated and self.parallax_px > 0.3 else ""
+        if seen.alone:
+            return f"frozen {seen.alone} image"
+        if self.parallax_px <= 0.3:
+            return ""
+        return "frozen image" if seen.repeated else "a part of the image is frozen" if seen.partly else ""
 
     def is_fresh(self, t_ns: int, many: int) -> bool:
         """Whether the reference has ``many`` points, and the last believed motion can still be prolonged."""

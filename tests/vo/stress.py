@@ -180,6 +180,17 @@ def frozen_right(footage: Footage) -> Footage:
     return replace(footage, frames=[replace(f[k], right=f[k // 20 * 20 + min(k % 20, 9)].right) for k in range(len(f))])
 
 
+def half_frozen(footage: Footage) -> Footage:
+    """The lower half of every sixth pair is still that of the pair before."""
+
+    def late(before: np.ndarray, now: np.ndarray) -> np.ndarray:
+        return np.vstack([now[: len(now) // 2], before[len(now) // 2 :]])
+
+    f = footage.frames
+    frames = [replace(b, left=late(a.left, b.left), right=late(a.right, b.right)) for a, b in pairwise(f)]
+    return replace(footage, frames=[f[0], *(frames[k - 1] if k % 6 == 0 else f[k] for k in range(1, len(f)))])
+
+
 def interlaced(footage: Footage) -> Footage:
     """Every second row is that of the frame before."""
 

@@ -104,11 +104,33 @@ def test_a_bonnet_neither_biases_the_motion_nor_goes_unnamed(footage: stress.Foo
     assert any("mask what is fixed to the camera" in finding for finding in odometry.pair.findings())
 
 
-def test_a_frozen_right_image_says_nothing_of_the_cameras(footage: stress.Footage) -> None:
+def test_a_frozen_image_says_nothing_of_the_cameras(footage: stress.Footage) -> None:
     """Ten frames long. Its rows were taken for a knock and for a delay, which the motions after it had to bear."""
-    changed = stress.run(stress.frozen_right(footage))
-    assert [r.status for r in changed.records[10:]] == [Status.LOST] * 10 + [Status.OK] * 4
-    assert changed.error_m[20:].max() < 0.1 * changed.moved_m[20:].min()
+    right = stress.frozen_right(footage).frames
+    left = [replace(f, left=footage.frames[min(k, 9) if k < 20 else k].left) for k, f in enumerate(footage.frames)]
+    for frames in (right, left):
+        changed = stress.run(replace(footage, frames=frames))
+        assert [r.status for r in changed.records[10:]] == [Status.LOST] * 10 + [Status.OK] * 4
+        assert changed.error_m[20:].max() < 0.1 * changed.moved_m[20:].min()
+
+
+def test_rows_of_the_frame_before_are_no_scene_at_rest(footage: stress.Footage) -> None:
+    """The lower half of every sixth pair is that of the pair before: it was a second motion, and 8 of 23 in doubt."""
+    outcome = stress.run(stress.half_frozen(footage))
+    assert [k for k, r in enumerate(outcome.records) if r.status is not Status.OK] == [0, 6, 12, 18]
+    assert outcome.reasons == {"a part of the image is frozen"}
+    assert outcome.silent == []
+
+
+def test_a_caption_is_no_frozen_part(footage: stress.Footage) -> None:
+    """Rows of lettering that never change, over a sixth of the image."""
+    lettering = np.kron(np.random.default_rng(0).integers(0, 2, (10, 80)), np.ones((6, 6))) * 255
+
+    def write(image: np.ndarray) -> np.ndarray:
+        return np.vstack([image[:300], lettering.astype(np.uint8)])
+
+    frames = [replace(f, left=write(f.left), right=write(f.right)) for f in footage.frames]
+    assert not any("frozen" in reason for reason in stress.run(replace(footage, frames=frames)).reasons)
 
 
 def test_corners_of_noise_speak_against_no_pair(footage: stress.Footage) -> None:
