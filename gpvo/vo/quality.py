@@ -37,7 +37,8 @@ _CURES = {
     "swapped": "most points lie behind the cameras; exchange left and right",
     "rows": "most points are in a different row on the right; calibrate the pair again",
     "few": "most points are not found in the right image; look at its exposure, focus and lens, and whether the"
-    " calibration is of these images: ones that are rectified already have another",
+    " calibration is of these images: ones that are rectified already have another; what is very near takes"
+    " --set max_disparity_share=0.5",
     "blur": "one image is much more blurred than the other; focus and clean both lenses, and shorten their exposure",
     "light": "left and right differ in brightness; give both cameras the same exposure and gain",
     "woven": "every second row is of another moment; let the cameras scan progressively, or drop these rows",

@@ -338,6 +338,7 @@ def test_points_without_a_partner_may_speak_of_another_calibration() -> None:
     for _ in range(9):
         watch.step(Observation(None, False), RightSearch(100, 30, 0, 5, np.zeros(0), np.zeros(0)))
     assert "whether the calibration is of these images" in watch.findings()[0]
+    assert "max_disparity_share" in watch.findings()[0]  # which alone lets odometry see a wall at two baselines
 
 
 def test_points_beyond_the_right_image_are_not_missing() -> None:
