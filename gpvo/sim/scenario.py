@@ -20,16 +20,12 @@ from gpvo.parallel import map_jobs
 from gpvo.sim.points import simulate_points
 from gpvo.sim.points_scenario import FOLDER, PointsScenario, check_values, scenarios
 from gpvo.sim.rig import CAMERAS, camera_rig
+from gpvo.types import field_names
 
 CalibrationKey = Literal["baseline", "focal", "rotation_rad", "distortion"]
 Cause = Literal["darkness", "dust", "motion_blur", "bare_wall", "image_noise"]
 Deviation = Annotated[float, Field(ge=-0.5, le=0.5)]  # beyond, not even the simulator's cameras would make a pair
 Share = Field(0.0, ge=0.0, le=0.5)
-_SHARED = (
-    "world", "world_seed", "duration_s", "rest_s", "rate_hz", "speed_mps", "imu", "imu_rate_hz", "episodes_share",
-    "causes", "dark", "waypoints",
-)  # fmt: skip
-"""What flights with images and without take alike."""
 _IMAGES_ALONE = {
     "noise_sigma": "points.sigma_px", "noise_every": "points.noise_every", "frozen": "points.frozen",
     "dropped": "points.drop", "black": "points.dark", "late": "", "imu_offset_s": "",
@@ -159,8 +155,9 @@ def points_scenario(scenario: Scenario) -> PointsScenario:
     base = scenarios().get(scenario.name, PointsScenario())
     own = load_scenario(scenario.name).camera if scenario.name in scenarios() else None
     camera = base.camera if scenario.camera == own else Rectifier(camera_rig(scenario.camera)).camera
+    alike = set(field_names(PointsScenario)) & Scenario.model_fields.keys() - _IMAGES_ALONE.keys()
     values: dict[str, Any] = {
-        **{name: getattr(scenario, name) for name in _SHARED},
+        **{name: getattr(scenario, name) for name in alike},
         "path": scenario.trajectory or scenario.path,
         "camera": camera,
         # A rectified pair has no distortion to be wrong.
