@@ -76,9 +76,9 @@ def read_stereo_yaml(path: Path, *, size: tuple[int, int] | None = None) -> Ster
     )
 
 
-def find_calibration(folder: Path) -> Path | None:
-    """The calibration file in a folder, None where there is none."""
-    found = (path for pattern in CALIBRATION_NAMES for path in sorted(folder.glob(pattern)))
+def find_calibration(*folders: Path) -> Path | None:
+    """The calibration file in the first folder that has one; None where there is none."""
+    found = (path for folder in folders for pattern in CALIBRATION_NAMES for path in sorted(folder.glob(pattern)))
     return next((path for path in found if path.is_file()), None)
 
 

@@ -75,10 +75,7 @@ class BagSource(ImageSource):
     ) -> None:
         if truth_frame not in (None, "imu", "cam"):
             raise SourceError(f"truth frame '{truth_frame}' is neither 'imu' nor 'cam'")
-        beside = (path, path.parent) if path.is_dir() else (path.parent,)
-        chain = (
-            Path(calibration) if calibration is not None else next(filter(None, map(find_calibration, beside)), None)
-        )
+        chain = Path(calibration) if calibration is not None else find_calibration(path, path.parent)
         with open_bag(path) as reader:
             asked = (left_topic, right_topic, imu_topic, truth_topic)
             self._topics = _choose_topics(reader, path, chain, asked, any_truth=truth_frame is not None)

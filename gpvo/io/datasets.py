@@ -107,7 +107,7 @@ def _euroc_rig(path: Path, mav: Path, given: Path | None) -> StereoRig:
         imu, body = mav / "imu0" / "sensor.yaml", mav / "body.yaml"
         is_flu = body.is_file() and str(read_yaml(body).get("axes", "")).upper() == "FLU"
         return read_sensor_pair(*sensors, imu=imu if imu.is_file() else None, body_is_flu=is_flu)
-    chain = given or next((c for c in map(find_calibration, (path, mav, path / "dso", mav.parent)) if c), None)
+    chain = given or find_calibration(path, mav, path / "dso", mav.parent)
     if chain is None:
         text = "no calibration: neither cam0/sensor.yaml and cam1/sensor.yaml nor dso/camchain.yaml"
         cure = "put Kalibr's camchain.yaml into the folder or name one with --calibration"
