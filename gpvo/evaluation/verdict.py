@@ -356,9 +356,11 @@ def _of_truth_and_path(e: Evaluation) -> Iterator[str]:
     log = flag_slips(e.run.log)
     piece = np.cumsum(~log.usable & log.column("is_reference"))[e.covered]
     size, true_size = (_extent(T[e.covered, :3, 3], piece) for T in (e.T_est, e.T_true))
+    whole = _extent(e.T_true[e.covered, :3, 3], np.zeros_like(piece))
     is_told = e.turned is not None and e.turned.scale != 1.0
     is_one_path = e.inverse is None and not is_told and not _are_strangers(e)
-    if is_one_path and true_size > _LEAST_PATH_M and not 1 / _MOST_SCALE < size / true_size < _MOST_SCALE:
+    told = is_one_path and whole > _LEAST_PATH_M and true_size > 0
+    if told and not 1 / _MOST_SCALE < size / true_size < _MOST_SCALE:
         yield _of_size("path is", size / true_size, e.run.log.camera)
 
 

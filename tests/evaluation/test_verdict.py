@@ -200,6 +200,16 @@ def test_a_log_that_starts_again_at_its_origin_is_not_in_another_unit() -> None:
     lines = verdict(evaluate_run(run)).lines
     assert any("In 1 of 600 motions" in line for line in lines)
     assert not any("in metres?" in line for line in lines), lines
+    feet = [replace(r, T_prev_cur=longer(r.T_prev_cur, 3.28), is_reference=True) for r in log]
+    often_lost = [r.with_status(Status.LOST, "dark") if k % 20 == 10 else r for k, r in enumerate(feet)]
+    lines = verdict(evaluate_run(replace(run, log=replace(log, records=often_lost)))).lines
+    assert any("path is 3.2" in line for line in lines), lines
+
+
+def longer(T: np.ndarray, factor: float) -> np.ndarray:
+    out = T.copy()
+    out[:3, 3] *= factor
+    return out
 
 
 def test_odometry_propagated_between_corrections_is_told_from_a_truth_that_was_made_of_it() -> None:
