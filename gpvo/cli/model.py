@@ -70,7 +70,7 @@ def predict(
 
 
 def _summary(predictions: StoredPredictions) -> dict[str, Any]:
-    told = [(p.sigma, p.in_domain > 0.5) for p in predictions if p.dt_s > 0 and p.status.severity < 2]
+    told = [(p.sigma, p.in_domain > 0.5) for p in predictions if p.measured]
     sigma = np.median([s for s, _ in told], axis=0) if told else np.full(6, np.nan)
     return {
         "predictions": len(predictions),

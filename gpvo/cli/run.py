@@ -63,7 +63,7 @@ def run(
 
         def on_frame(step: runner.Step, prediction: Prediction | None) -> None:
             advance()
-            if prediction is not None and prediction.status is not Status.LOST:
+            if prediction is not None and prediction.measured:
                 inside.append(bool(prediction.in_domain > 0.5))
             if show is not None:
                 show(step, prediction)

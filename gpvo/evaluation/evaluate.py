@@ -69,7 +69,8 @@ class Evaluation:
     ``tells_from_m``: length of path from which odometry's errors outweigh it. ``late_s``: offset between the clocks,
     where it matters and none was given; ``turned``: a fixed rotation between truth and odometry, likewise; ``inverse``:
     poses of one of the two seem to be inverse; ``unlike``: how little the two resemble each other, where they do not.
-    ``in_domain``: share of the measured motions that lie in the model's training domain, None without a model.
+    ``in_domain``: share of the measured motions that lie in the model's training domain, None without any or a
+    model.
     ``misfits``: why else the model does not fit the run, or cannot be judged by it. ``poses``: scores of the
     covariances of poses that a log states.
     """
@@ -262,7 +263,7 @@ def _misfits(run: Run, predictor: Predictor | None, known: tuple[str, ...] | Non
 
 def _in_domain(predictions: Mapping[int, Prediction]) -> float | None:
     """A motion that is lost, as one after a jump, was not measured: it tells nothing about the conditions."""
-    measured = [bool(p.in_domain > 0.5) for p in predictions.values() if p.dt_s > 0 and p.status is not Status.LOST]
+    measured = [bool(p.in_domain > 0.5) for p in predictions.values() if p.measured]
     return float(np.mean(measured)) if measured else None
 
 

@@ -191,7 +191,8 @@ class Engine:
         self.counts[f"frames_{message.status.value}"] += 1
         if record.dt_s > 0:
             self._motions.append(record)
-            self._inside.append(message.in_domain is None or message.in_domain > 0.5)
+        if prediction is not None and prediction.measured:
+            self._inside.append(bool(prediction.in_domain > 0.5))
         # What is kept, also in the state, is the accumulated one: the next session begins with it.
         sent = self._of_increment(message, record, prediction) if self._increment else message
         self._deliver(lambda output: output.odometry(sent))

@@ -114,6 +114,11 @@ class Prediction(MotionError):
     confidence: float | Array
     in_domain: float | Array
 
+    @property
+    def measured(self) -> bool:
+        """Of a single one: whether the motion was measured, so that its inputs tell of the conditions."""
+        return bool(self.dt_s > 0) and not self.lost
+
 
 @dataclass(frozen=True, eq=False)
 class StoredPredictions(Columns[Prediction]):
