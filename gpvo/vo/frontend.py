@@ -20,15 +20,15 @@ from gpvo.vo.config import VoConfig
 from gpvo.vo.opencv import Image, ImageStats, Light, Points, image_stats
 from gpvo.vo.rig_error import RigError
 
-_PART = 1 / 8  # of an image's rows
+_PART = 1 / 8  # of an image's rows: fewer cannot make a motion of their own
 
 
 @dataclass(frozen=True)
 class Observation:
     """What is known about a frame before its motion is.
 
-    ``repeated``: the pair is identical to that of the previous frame; ``alone``: or which of its images is, ``left`` or
-    ``right``; ``partly``: or an eighth or more of the rows of one are, as they were not a frame ago.
+    ``repeated``: the pair is identical to that of the previous frame; ``alone``: which image alone is, ``left`` or
+    ``right``; ``partly``: an eighth or more of the rows of one are, and hold a picture, as they were not a frame ago.
     ``right_light``: by what factor the right image is brighter or has more contrast; 1 if they are alike.
     ``right_blur``: by what factor it is more blurred. ``woven``: every second row of one is of another moment.
     """

@@ -321,7 +321,7 @@ class KltFrontend:
         # A pair that is off by the same rows everywhere is still a pair: its rows are counted from there.
         usual = float(np.median(row_error[np.isfinite(row_error)])) if np.isfinite(row_error).any() else 0.0
         off_row = both.inside & (np.abs(row_error - usual) > self._config.max_row_error_px)
-        # Nor would noise be found, were it a pair.
+        # Corners of noise would not be found even in a good pair.
         sought = both.inside & (np.isfinite(row_error) | stands_out(both.seen.patches, 255 * view.stats.noise_level))
         least_px = self._config.min_disparity_px
         known = both.inside & np.isfinite(row_error)

@@ -301,8 +301,7 @@ class StereoOdometry:
             moments = ResidualMoments.of(motion.residuals, white.moved.G)
             record = replace(record, **motion_fields(matches, motion, self.camera, moments))
         if motion is None or verdict.status is Status.LOST:
-            if matches.displaced is not None and not (self.pair.late or self.pair.unsharp):
-                self.rig_error.update_rows(*matches.displaced)
+            self.rig_error.update_rows(None if self.pair.late or self.pair.unsharp else matches.displaced)
             known = None if state.t_twist_ns is None else state.twist
             C = lost_covariance((t_ns - state.t_believed_ns) * 1e-9, known)
             return replace(

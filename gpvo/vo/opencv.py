@@ -206,12 +206,13 @@ def woven(image: NDArray[np.uint8]) -> bool:
 
 
 def same_rows(image: NDArray[np.uint8], before: NDArray[np.uint8]) -> tuple[bool, NDArray[np.bool_]]:
-    """Whether two images are equal, and (H,) which of their rows are, and hold a picture."""
+    """Whether two images (H, W) are equal, and (H,) which rows are: of images that are not, those with a picture."""
     same = (image[:, ::8] == before[:, ::8]).all(axis=1)
     same[same] = (image[same] == before[same]).all(axis=1)
-    equal = bool(same.all())
-    same[same] = image[same].std(axis=1) > _NO_PICTURE
-    return equal, same
+    if same.all():
+        return True, same
+    same[same] = image[same].std(axis=1, dtype=np.float32) > _NO_PICTURE
+    return False, same
 
 
 def in_light_of(image: NDArray[np.uint8], own: Light, other: Light) -> NDArray[np.uint8]:

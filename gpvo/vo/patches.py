@@ -70,8 +70,8 @@ def cut(image: Image, uv: Points, window_px: int) -> Patches:
 
 
 def stands_out(patches: Patches, noise: float) -> NDArray[np.bool_]:
-    """(N,) which patches (N, 3, M), as of :func:`cut`, would look alike in another image with as much noise, of this
-    standard deviation [grey values]."""
+    """(N,) which patches (N, 3, M), as of :func:`cut`, vary enough beside ``noise``, its standard deviation [grey
+    values], to be recognised in another image with as much."""
     return np.asarray(2 * noise**2 < _ALIKE**2 * np.square(patches[:, 0]).mean(axis=1))
 
 

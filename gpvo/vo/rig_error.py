@@ -267,14 +267,14 @@ class RigError:
         weighted = rows * np.minimum(1.0, 2.5 * sigma / np.maximum(off, 1e-9)) / sigma**2
         self._blocks[1].add(weighted @ rows.T, weighted @ row_error)
 
-    def update_rows(self, uvd: Array, row_error: Array) -> None:
-        """Learn from rows (M,) at measurements (M, 3) alone: those of a pair whose rows leave no motion to be found."""
-        if self._learn and self._lasts(True):
-            self._learn_rows(self._terms(uvd, self.twist)[1], row_error)
+    def update_rows(self, displaced: tuple[Array, Array] | None) -> None:
+        """Learn from rows alone, as of :meth:`displaced`, of a pair without a motion; None where they tell nothing."""
+        if self._learn and self._lasts(displaced is not None) and displaced is not None:
+            self._learn_rows(self._terms(displaced[0], self.twist)[1], displaced[1])
             self._conclude()
 
     def _lasts(self, displaced: bool) -> bool:
-        """Whether this pair tells of the cameras: rows that one alone displaces were lost on their way."""
+        """Whether this pair tells of the cameras: rows that it alone displaces, not the pair before, were lost."""
         before, self._displaced = self._displaced, displaced
         return before or not displaced
 

@@ -24,6 +24,7 @@ from gpvo.vo.motion import Motion, predict_uvd, residual_covariance, transfer
 _CELLS = 96  # of the whole image
 EXPLAINED = 0.8  # share of the cells; below, a rival is looked for
 _LEAST = 8  # points: a motion through any three is found by chance, a tight one through eight is not
+_NOISY = 3.0  # times the noise of a point, as the motion makes it: it may be off by as much
 _STILL_PX = 0.5  # change of a measurement by noise alone
 _SHARE = 1 / 8  # of the other's cells: a motion seen over less is that of an object
 _NOISE = 9.0  # standard deviations of odometry's own noise that are no change of velocity
@@ -273,9 +274,9 @@ def unexplained(
         return None
     off_px = _off_px(motion.T_prev_cur, matches, camera)
     allowed_px = np.full(len(off_px), max(near_px, 6 * motion.scale_px))
-    if 2 * motion.inliers.sum() > len(off_px):  # what most points contradict cannot call them noisy
+    if 2 * motion.inliers.sum() > matches.strong.sum():  # what most points contradict cannot call them noisy
         # A compromise between two motions has larger residuals than the last motions had.
-        noise_px = 3 * min(usual_px, motion.scale_px) * _amplified(motion, matches, camera)
+        noise_px = _NOISY * min(usual_px, motion.scale_px) * _amplified(motion, matches, camera)
         allowed_px = np.maximum(allowed_px, noise_px)
     free = (matches.uvd_prev[:, 2] > KNOWN_DEPTH_PX) & (off_px > allowed_px)
     return free if free.sum() >= _LEAST else None

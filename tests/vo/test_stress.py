@@ -379,6 +379,23 @@ def test_a_scene_speaks_against_a_patch_with_more_points() -> None:
     assert unexplained(scene_motion, share, alone, CAMERA, near[0], 0.0) is None
 
 
+def test_only_a_motion_that_most_points_agree_with_may_call_the_others_noisy() -> None:
+    """Near points that are off by three times the tolerance, as much as an error of depth of two sigma makes there."""
+    rng = np.random.default_rng(0)
+    T, far, _ = scene(rng, 60, (10, 40))
+    _, near, _ = scene(rng, 40, (1.2, 1.5))
+    ahead = T @ se3.exp(np.array([0, 0, 1.0, 0, 0, 0]))
+    uvd_prev = np.concatenate([far, near])
+    uvd_cur = transfer(ahead, uvd_prev + np.outer(np.arange(100) >= 60, [0, 0, 1.0]), CAMERA).uvd.T
+    motion = refine(ahead, far, uvd_cur[:60], CAMERA)
+    assert motion is not None
+    for most in (True, False):
+        inliers = np.arange(100) < (60 if most else 49)
+        of_all = replace(motion, inliers=inliers, scale_px=0.5)
+        free = unexplained(of_all, 0.5, Matches(uvd_prev, uvd_cur, np.zeros(100), 100), CAMERA, 2.0, 0.5)
+        assert (free is None) == most
+
+
 def drive(count: int) -> stress.Footage:
     """The first frames of KITTI raw 0001."""
     source = open_source(Path(os.environ["GPVO_DATA"]) / "kitti_2011_09_26_0001")
