@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import csv
 import re
+import shlex
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
@@ -73,9 +74,16 @@ _VELOCITY = re.compile(r"(?:.*_)?(?:v_?[xyz]|vel|velocity|twist)(?:_.*|[xyz])?")
 _GEOGRAPHIC = {"lat", "latitude", "lon", "lng", "longitude"}
 _VARIANCE = re.compile(rf"(?:pose_|position_)?(?:var|variance)_({_AXIS})")
 _LENGTHS_M = {"m": 1.0, "mm": 1e-3, "cm": 1e-2, "km": 1e3, "ft": 0.3048}
+_METRES = {"": 1.0, "milli": 1e-3, "centi": 1e-2, "kilo": 1e3}
+_LENGTHS_M |= {f"{k}met{end}": size for k, size in _METRES.items() for end in ("er", "ers", "re", "res")}
 _ANGLES_RAD = {"rad": 1.0, "mrad": 1e-3, "deg": np.pi / 180}
 # In brackets, or behind an underscore; of a variance, squared or not.
 _UNIT = re.compile(rf"(?:[\[(] *|_)({'|'.join((*_LENGTHS_M, *_ANGLES_RAD))})(?:\^?2|²)?(?: *[\])])?$")
+_BRACKETS = re.compile(r"[\[(](.*?)[\])]")
+_STAMP_UNITS = {name: unit for unit in UNITS_NS for name in (unit, f"{unit}ec", f"{unit}ecs")}
+_STAMP_UNITS |= {"µs": "us", "μs": "us"}  # the sign for micro, and the Greek letter
+_SECONDS = {"": "s", "milli": "ms", "micro": "us", "nano": "ns"}
+_STAMP_UNITS |= {f"{k}second{end}": unit for k, unit in _SECONDS.items() for end in ("", "s")}
 # What tells how wrong a motion may be: an uncertainty, or what odometry counts and sees.
 _TELLING = re.compile(
     r"cov|var|sigma|std|^p_?\d\d$|inlier|feature|tracked|match|landmark|keypoint|reproj|disparity|bright|contrast|sharp",
@@ -103,7 +111,7 @@ def read_table(path: Path, mapping: Mapping[str, str]) -> Table:
     in the unit of its target or name; where only a guess says seconds, 16 digits and more are nanoseconds. ROS's
     nanoseconds beyond whole seconds are added where their column stands beside. Positions and covariances are in the
     unit of their column's name, else in m and rad. Raises SourceError, naming file and line, or the column that is
-    wanted.
+    wanted or whose unit is not known.
     """
     lines = _lines(path)
     first = next(lines, None)
@@ -238,6 +246,9 @@ def _targets(path: Path, header: list[str], mapping: Mapping[str, str]) -> dict[
     if absent:
         text = f"no column for {', '.join(absent)} (there are: {', '.join(header)})"
         raise SourceError(text, where=path, cure=_cure_of_absent(absent, [c for c in header if c not in mapping]))
+    for target, index in found.items():
+        if header[index] not in mapping:
+            _check_unit(path, header[index], target)
     return found
 
 
@@ -273,13 +284,33 @@ def _plain(column: str) -> str:
 def _to_si(column: str, target: str) -> float:
     """What the numbers of a column are multiplied by to be metres or radians, of a covariance their squares or
     products, by the unit in its name; 1 where that states none."""
-    unit = _UNIT.search(column.strip().lower())
+    unit = _UNIT.search(column.strip().lower()) or _UNIT.search(_plain(column))
     if unit is None or target[:2] not in ("p_", "co"):
         return 1.0
     units = [_ANGLES_RAD if axis in "345" else _LENGTHS_M for axis in target[4:]] or [_LENGTHS_M]
     if not all(unit[1] in known for known in units):
         return 1.0
     return float(np.prod([known[unit[1]] for known in units]))
+
+
+def _check_unit(path: Path, column: str, target: str) -> None:
+    """Refuse a column whose name states, in brackets, a unit that is not known: else it would be read as metres, or
+    seconds. Raises SourceError, naming the column."""
+    stated = _BRACKETS.search(column)
+    words = set(re.findall(r"[^\W\d_]+", stated[1].lower())) if stated else set()
+    if target in _STAMPS:
+        known, cure = {*_STAMP_UNITS}, f"write seconds, or {_unit_cure(column, 's')}"
+    elif target in _POSE[:3] or target in _COV:
+        units = _LENGTHS_M if target in _POSE else _LENGTHS_M | _ANGLES_RAD
+        known = {name for name, size in units.items() if size == 1.0}
+        short = ", ".join(name for name in units if len(name) < 5)
+        si = "metres" if target in _POSE else "of metres and radians"
+        cure = f"units are {short}; if it is {si}, --map {shlex.quote(f'{column}={target}')}, of truth --truth-map"
+    else:
+        return
+    if stated and not words <= known and _to_si(column, target) == 1.0:
+        what = f"the column '{column}' is in '{stated[1]}', which is no unit that is read"
+        raise SourceError(what, where=path, cure=cure)
 
 
 def _units_apart(named: Mapping[str, str]) -> Iterator[str]:
@@ -298,13 +329,13 @@ def _rest_of_seconds(header: list[str], column: str) -> int | None:
 
 def _suggest(column: str) -> str | None:
     """What a column name means to most people."""
-    unit, name = re.search(r"[\[(](.*?)[\])]", column), re.sub(r"^.*header_(?=stamp)", "", _plain(column))
+    unit, name = _BRACKETS.search(column), re.sub(r"^.*header_(?=stamp)", "", _plain(column))
     if name in TARGETS:
         return name
     name = _UNIT.sub("", name)
     if name in _STAMP_NAMES:
-        said = unit[1].strip() if unit else name.rpartition("_")[2]
-        return f"t_{said}" if said in UNITS_NS else "t_s"
+        said = unit[1].strip().lower() if unit else name.rpartition("_")[2]
+        return f"t_{_STAMP_UNITS.get(said, 's')}"
     if name in _OPENVINS:
         return _OPENVINS[name]
     if named := _COVARIANCE.fullmatch(name) or _VARIANCE.fullmatch(name):
@@ -327,7 +358,7 @@ def _suggest(column: str) -> str | None:
 def _unit_cure(column: str, unit: str) -> str:
     """How to say in which unit a column of stamps is, most likely ``unit``."""
     others = ", ".join(f"t_{u}" for u in UNITS_NS if u != unit)
-    return f"name the unit: --map {column}=t_{unit} (or {others}), for ground truth with --truth-map"
+    return f"name the unit: --map {shlex.quote(f'{column}=t_{unit}')} (or {others}), for ground truth with --truth-map"
 
 
 def _stamp(text: str, unit: str, is_stated: bool) -> int:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -177,6 +178,55 @@ def test_covariances_are_in_the_unit_of_their_column(tmp_path: Path) -> None:
     path.write_text(path.read_text().replace(",x,", ",x_mm,", 1))
     [note] = read_foreign(path).notes
     assert "x_mm is converted to metres, the covariances, which name no unit, are not" in note
+
+
+@pytest.mark.parametrize("unit", [" / mm", " mm", "[millimeters]", " (Centimetre)", "_kilometers"])
+def test_a_unit_may_be_written_in_other_ways(unit: str, tmp_path: Path) -> None:
+    """They were read as metres."""
+    metres = {"mm": 1e-3, "mi": 1e-3, "ce": 1e-2, "ki": 1e3}[unit.lstrip(" /[(_")[:2].lower()]
+    path = tmp_path / "log.csv"
+    head = f"t,x{unit},y{unit},z{unit},qx,qy,qz,qw"
+    path.write_text("\n".join([head, *(f"{k * 0.1:.1f},{3.0 * k / metres!r},0,0,0,0,0,1" for k in range(5))]))
+    np.testing.assert_allclose(read_foreign(path).trajectory.T_world_body[4, :3, 3], [12, 0, 0], rtol=1e-12)
+
+
+@pytest.mark.parametrize(
+    ("name", "column"),
+    [("x [in]", 1), ("y (dm)", 2), ("z[um]", 3), ("cov_xx [mm*deg]", 8), ("cov_yaw_yaw (grad)", 8)],
+)
+def test_a_unit_that_is_not_known_is_asked_about(name: str, column: int, tmp_path: Path) -> None:
+    """They were read as metres and radians; who says so has them read as such."""
+    names = [*"txyz", "qx", "qy", "qz", "qw", "var_x"]
+    names[column] = name
+    path = tmp_path / "log.csv"
+    path.write_text("\n".join([",".join(names), *(f"{k * 0.1:.1f},{POSE},1" for k in range(5))]))
+    with pytest.raises(SourceError, match="is no unit that is read") as caught:
+        read_foreign(path)
+    (given,) = re.findall(r"--map '(.*)'", str(caught.value))
+    assert given.startswith(f"{name}=")
+    assert len(read_foreign(path, mapping=dict([given.rsplit("=", 1)])).t_ns) == 5
+
+
+@pytest.mark.parametrize("unit", ["[]", "[m]", "(meters)", "[-]", "[1]", "_m"])
+def test_a_unit_of_the_si_changes_nothing(unit: str, tmp_path: Path) -> None:
+    path = tmp_path / "log.csv"
+    path.write_text("\n".join([f"t,x{unit},y,z,qx [-],qy [a],qz,qw", *(f"{k * 0.1:.1f},{POSE}" for k in range(5))]))
+    assert len(read_foreign(path).t_ns) == 5
+
+
+@pytest.mark.parametrize("unit", ["msec", "Milliseconds", "millisecond", "ms"])
+def test_stamps_are_in_the_unit_of_their_column_however_it_is_written(unit: str, tmp_path: Path) -> None:
+    """At 100 Hz and more, milliseconds from zero were read as seconds, with a remark."""
+    path = tmp_path / "log.csv"
+    path.write_text("\n".join([f"time [{unit}],x,y,z,qx,qy,qz,qw", *(f"{k * 10},{POSE}" for k in range(5))]))
+    np.testing.assert_array_equal(read_foreign(path).t_ns, np.arange(5) * 10_000_000)
+
+
+def test_a_unit_of_stamps_that_is_not_known_is_asked_about(tmp_path: Path) -> None:
+    path = tmp_path / "log.csv"
+    path.write_text("\n".join(["time [min],x,y,z,qx,qy,qz,qw", *(f"{k * 0.01:.2f},{POSE}" for k in range(5))]))
+    with pytest.raises(SourceError, match=r"'time \[min\]' is in 'min'.*write seconds, .*--map 'time \[min\]=t_s'"):
+        read_foreign(path)
 
 
 def test_of_a_twist_they_are_not_the_poses(tmp_path: Path) -> None:
