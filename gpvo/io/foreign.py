@@ -18,7 +18,7 @@ from gpvo.geometry.covariance import variances
 from gpvo.geometry.se3 import T_FLU_OPTICAL
 from gpvo.io.bag_messages import covariances_of, read_poses
 from gpvo.io.bag_reader import ODOMETRY_TYPE, POSE_TYPES, is_bag, open_bag, topics_of
-from gpvo.io.foreign_csv import POSITIONS_ALONE, Table, names_other_columns, read_table
+from gpvo.io.foreign_csv import POSITIONS_ALONE, Table, column_names, is_tum, read_table
 from gpvo.io.stamps import check_interval, is_number, text_lines
 from gpvo.io.trajectory import REMOVE, Trajectory, check_growing, check_unit, read_kitti_poses, read_times, read_tum
 from gpvo.stats.consistency import SEEN, seen_axes
@@ -126,15 +126,16 @@ def guess_format(path: Path) -> str:
         return "bag"
     if path.is_dir():
         raise SourceError("is a folder, not a log", where=path, cure="name the trajectory file or the bag")
-    comment, data = "", ""
+    comments, data = list[str](), ""
     for _, data in islice(text_lines(path), 50):
         if not data.startswith("#"):
             break
-        comment, data = data, ""
+        comments.append(data)
+        data = ""
     words = data.split()
     if "," in data or ";" in data or not all(map(is_number, words)):
         return "csv"
-    if comment and names_other_columns(comment.lstrip("# ").split(), len(words)):
+    if (names := column_names(comments, len(words))) and not is_tum(names):
         return "csv"
     if len(words) in (8, 12):
         return "tum" if len(words) == 8 else "kitti"

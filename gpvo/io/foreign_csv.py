@@ -166,22 +166,23 @@ def read_table(path: Path, mapping: Mapping[str, str]) -> Table:
 
 
 def _lines(path: Path) -> Iterator[tuple[int, list[str]]]:
-    """Line numbers and fields, the header first: the first line of names, or the last comment before the numbers; 0 is
-    the number of that which the layout of VINS-Fusion stands for."""
+    """Line numbers and fields, the header first: the first line of names, or the last comment before the numbers that
+    names columns, else the last; 0 is the number of that which the layout of VINS-Fusion stands for."""
     try:
-        comment: tuple[int, str] | None = None
+        comments: dict[int, str] = {}
         separator: str | None = None
         for number, text in text_lines(path):
             if text.startswith("#"):
-                comment = (number, text.lstrip("#").strip())
+                comments[number] = text.lstrip("#").strip()
                 continue
             if separator is None:
                 separator = next((s for s in (",", ";", "\t") if s in text), " ")
-                if is_number(_split(text, separator)[0]):
-                    if comment is None:
+                if is_number((fields := _split(text, separator))[0]):
+                    if not comments:
                         yield 0, _implied_header(path, text, separator)
                     else:
-                        yield comment[0], _split(comment[1], separator)
+                        top, last = max(comments.items())
+                        yield top, column_names([*comments.values()], len(fields)) or _split(last, separator)
             yield number, _split(text, separator)
     except csv.Error as error:
         raise SourceError(f"is not a CSV file: {error}", where=path) from None
@@ -210,13 +211,26 @@ def _split(text: str, separator: str) -> list[str]:
     return [f.strip() for f in next(csv.reader([text], delimiter=separator))]
 
 
-def names_other_columns(words: list[str], count: int) -> bool:
-    """Whether the words above rows of ``count`` numbers name them, a stamp and a pose among them, and otherwise than
-    TUM has them."""
-    named = [_suggest(w) for w in words]
-    if len(words) != count or not {*named} & {*_STAMPS} or not {*named} >= {*_POSE}:
+def column_names(comments: list[str], count: int) -> list[str] | None:
+    """The names of ``count`` columns, a stamp and a pose among them, in the last of the comments above them that holds
+    such, with commas, other signs or blanks between; None where none does."""
+    for comment in reversed(comments):
+        text = comment.lstrip("# ")
+        unspaced = re.sub(r"\s+(?=[\[(])", "", text)  # a unit belongs to the name before
+        for words in (*(text.split(s) for s in (",", ";", "\t", None)), unspaced.split()):
+            names = [word.strip() for word in words] if len(words) == count else []
+            named = {_suggest(name) for name in names}
+            if named & {*_STAMPS} and named >= {*_POSE}:
+                return names
+    return None
+
+
+def is_tum(names: list[str]) -> bool:
+    """Whether columns have the order and the units of TUM."""
+    layout = ("t_s", *_POSE)
+    if tuple(map(_suggest, names)) != layout:
         return False
-    return named != ["t_s", *_POSE]
+    return all(_unknown_unit(*pair) is None and _to_si(*pair) == 1.0 for pair in zip(names, layout))
 
 
 def _targets(path: Path, header: list[str], mapping: Mapping[str, str]) -> dict[str, int]:
@@ -293,24 +307,40 @@ def _to_si(column: str, target: str) -> float:
     return float(np.prod([known[unit[1]] for known in units]))
 
 
-def _check_unit(path: Path, column: str, target: str) -> None:
-    """Refuse a column whose name states, in brackets, a unit that is not known: else it would be read as metres, or
-    seconds. Raises SourceError, naming the column."""
-    stated = _BRACKETS.search(column)
+def _unknown_unit(column: str, target: str) -> str | None:
+    """The unit that the name of a column states in brackets, if it is none that is read."""
+    stated, known = _BRACKETS.search(column), {name for name, size in _units(target).items() if size == 1.0}
     words = set(re.findall(r"[^\W\d_]+", stated[1].lower())) if stated else set()
+    if stated is None or not known or words <= known or _to_si(column, target) != 1.0:
+        return None
+    return stated[1]
+
+
+def _units(target: str) -> dict[str, float]:
+    """What numbers of a target may be in, by name, 1 for what they are read as; none where they have no unit."""
     if target in _STAMPS:
-        known, cure = {*_STAMP_UNITS}, f"write seconds, or {_unit_cure(column, 's')}"
-    elif target in _POSE[:3] or target in _COV:
-        units = _LENGTHS_M if target in _POSE else _LENGTHS_M | _ANGLES_RAD
-        known = {name for name, size in units.items() if size == 1.0}
-        short = ", ".join(name for name in units if len(name) < 5)
+        return dict.fromkeys(_STAMP_UNITS, 1.0)
+    if target in _COV:
+        return _LENGTHS_M | _ANGLES_RAD
+    return _LENGTHS_M if target in _POSE[:3] else {}
+
+
+def _check_unit(path: Path, column: str, target: str) -> None:
+    """Refuse a column in a unit that is not known: else it would be read as metres, or seconds.
+
+    Raises SourceError, naming the column.
+    """
+    stated = _unknown_unit(column, target)
+    if stated is None:
+        return
+    if target in _STAMPS:
+        cure = f"write seconds, or {_unit_cure(column, 's')}"
+    else:
+        short = ", ".join(name for name in _units(target) if len(name) < 5)
         si = "metres" if target in _POSE else "of metres and radians"
         cure = f"units are {short}; if it is {si}, --map {shlex.quote(f'{column}={target}')}, of truth --truth-map"
-    else:
-        return
-    if stated and not words <= known and _to_si(column, target) == 1.0:
-        what = f"the column '{column}' is in '{stated[1]}', which is no unit that is read"
-        raise SourceError(what, where=path, cure=cure)
+    what = f"the column '{column}' is in '{stated}', which is no unit that is read"
+    raise SourceError(what, where=path, cure=cure)
 
 
 def _units_apart(named: Mapping[str, str]) -> Iterator[str]:

@@ -335,6 +335,39 @@ def test_a_comment_that_names_the_columns_is_their_header(tmp_path, header):
     np.testing.assert_allclose(read_foreign(tmp_path / "a.txt").trajectory.T_world_body, POSES, atol=1e-9)
 
 
+@pytest.mark.parametrize(
+    "above",
+    [
+        ["# timestamp tx ty tz qw qx qy qz", "# made by hand", "#"],
+        ["# t,x,y,z,qw,qx,qy,qz"],  # commas above blanks
+        ["# t x[mm] y[mm] z[mm] qw qx qy qz"],
+        ["# timestamp [s] tx [mm] ty [mm] tz [mm] qw [-] qx [-] qy [-] qz [-]"],
+    ],
+)
+def test_the_names_of_columns_are_found_among_the_comments(tmp_path, above):
+    """With w first, and in millimetres, they were read as TUM has them: as if x were first, and in metres."""
+    q, per_m = se3.rotation_to_quaternion_xyzw(POSES[:, :3, :3]), 1000 if "mm" in above[0] else 1
+    rows = [
+        " ".join([f"{t * 1e-9:.9f}", *(f"{v:.12g}" for v in (*T[:3, 3] * per_m, r[3], *r[:3]))])
+        for t, T, r in zip(T_NS, POSES, q, strict=True)
+    ]
+    (tmp_path / "a.txt").write_text("\n".join([*above, *rows]) + "\n")
+    np.testing.assert_allclose(read_foreign(tmp_path / "a.txt").trajectory.T_world_body, POSES, atol=1e-9)
+
+
+def test_a_comment_may_state_the_units_of_tum_or_others(tmp_path):
+    write_tum(tmp_path / "a.tum", T_NS, POSES)
+    for unit in ("m", "mm", "in"):
+        names = f"# timestamp [s] tx[{unit}] ty[{unit}] tz[{unit}] qx qy qz qw\n"
+        (tmp_path / f"{unit}.tum").write_text(names + (tmp_path / "a.tum").read_text())
+    assert guess_format(tmp_path / "m.tum") == "tum"
+    np.testing.assert_allclose(
+        read_foreign(tmp_path / "mm.tum").trajectory.T_world_body[:, :3, 3], 1e-3 * POSES[:, :3, 3], atol=1e-9
+    )
+    with pytest.raises(SourceError, match="no unit that is read"):
+        read_foreign(tmp_path / "in.tum")
+
+
 def test_the_comment_that_tum_has_changes_nothing(tmp_path):
     write_tum(tmp_path / "a.tum", T_NS, POSES)
     text = (tmp_path / "a.tum").read_text()
