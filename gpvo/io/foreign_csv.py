@@ -241,6 +241,9 @@ def _targets(path: Path, header: list[str], mapping: Mapping[str, str]) -> dict[
             raise SourceError(f"--map {column}={target}: unknown name '{target}'", where=path, cure=cure)
         if column not in header:
             raise SourceError(f"has no column '{column}' (there are: {', '.join(header)})", where=path)
+        if target in _COV and re.search("std|deviation", column.lower()):
+            text = f"--map {column}={target}: '{column}' is a standard deviation by its name, {target} a variance"
+            raise SourceError(text, where=path, cure="square its numbers, and give it another name")
     found: dict[str, int] = {mapping[c]: header.index(c) for c in mapping}
     # The sensor's time, of the header of a ROS message, before that of recording.
     for index, column in sorted(enumerate(header), key=lambda c: "header" not in c[1].lower()):

@@ -54,6 +54,15 @@ def test_columns_of_uncertainty_that_are_not_understood_are_named(tmp_path: Path
     assert "--map" in note
 
 
+@pytest.mark.parametrize("name", ["std_x", "pos_stddev_x", "X standard deviation"])
+def test_a_standard_deviation_is_not_mapped_to_a_variance(name: str, tmp_path: Path) -> None:
+    """A sigma of 1 cm was read as one of 10 cm."""
+    path = _csv(tmp_path / "log.csv", f"{name},var_y", "1,2")
+    with pytest.raises(SourceError, match=f"'{name}' is a standard deviation .*cov_00 a variance .square"):
+        read_foreign(path, mapping={name: "cov_00"})
+    assert len(read_foreign(path, mapping={"var_y": "cov_00"}).t_ns) == 5
+
+
 def test_a_covariance_of_the_position_alone_is_named(tmp_path: Path) -> None:
     log = read_foreign(_csv(tmp_path / "log.csv", "cov_xx,cov_yy,cov_zz", "1,2,3"))
     assert log.covariance is None
