@@ -65,7 +65,7 @@ _AXES |= {"roll": 3, "pitch": 4, "yaw": 5, "r": 3, "p": 4}
 _AXIS = "roll|pitch|yaw|[prt]?[xyz]|r|p"
 _COVARIANCE = re.compile(rf"(?:pose_|position_)?(?:cov|covariance)_({_AXIS})_?({_AXIS})")
 _POSED = re.compile(
-    r"(?:.*_)?(p|t|pos|position|translation|q|quat|quaternion|ori|orientation|rot|rotation)(?:_rs_r|_rs)?_?([xyzw])"
+    r"(?:.*_)?(p|t|pos|position|translation|q|quat|quaternion|ori|orientation|rot|rotation)(?:_[rwg][sib](?:_[rwg])?)?_?([xyzw])"
 )
 _NUMBERED = re.compile(
     r"(?:.*[_.])?(?:(?P<q>q(?:uat|uaternion)?_?\[?[0-3]\]?)|p(?:os|osition)?_?\[?[0-2]\]?)", re.IGNORECASE
@@ -271,7 +271,8 @@ def _targets(path: Path, header: list[str], mapping: Mapping[str, str]) -> dict[
 
 def _cure_of_absent(absent: list[str], columns: list[str]) -> str:
     """What to do about targets without a column, by the names of those that are not mapped."""
-    cure = f"name it with --map COLUMN={absent[0]}, for ground truth with --truth-map"
+    target = "t_s (or t_ms, t_us, t_ns)" if absent[0] == "t_s" else absent[0]
+    cure = f"name it with --map COLUMN={target}, for ground truth with --truth-map"
     plain, numbered = {_plain(c) for c in columns}, {c: m for c in columns if (m := _NUMBERED.fullmatch(c))}
     q, p = ([c for c, m in numbered.items() if bool(m["q"]) == of_q] for of_q in (True, False))
     q, p = q if len(q) == 4 and "q_x" in absent else [], p if len(p) == 3 and "p_x" in absent else []

@@ -377,6 +377,25 @@ def test_the_comment_that_tum_has_changes_nothing(tmp_path):
     assert guess_format(tmp_path / "c.tum") == "tum"
 
 
+@pytest.mark.parametrize("p, q", [("p_WS_W", "q_WS"), ("p_RS_R", "q_RS"), ("p_GI_G", "q_GI"), ("p_WB", "q_WB")])
+def test_columns_that_name_their_frames(tmp_path, p, q):
+    """As those of OKVIS do, with the quaternion's w last, and those of EuRoC, with w first."""
+    names = [*(f"{p}_{a}" for a in "xyz"), *(f"{q}_{a}" for a in "xyzw"), *(f"v_WS_W_{a}" for a in "xyz"), "b_g_x"]
+    Q = se3.rotation_to_quaternion_xyzw(POSES[:, :3, :3])
+    rows = [
+        ", ".join([str(int(t)), *(f"{v:.12g}" for v in (*T[:3, 3], *r)), "1", "2", "3", "4"])
+        for t, T, r in zip(T_NS, POSES, Q, strict=True)
+    ]
+    (tmp_path / "a.csv").write_text("\n".join([", ".join(["timestamp", *names]), *rows]))
+    np.testing.assert_allclose(read_foreign(tmp_path / "a.csv").trajectory.T_world_body, POSES, atol=1e-9)
+
+
+def test_the_cure_of_absent_stamps_names_their_units(tmp_path):
+    (tmp_path / "a.csv").write_text("TimeUS,x,y,z,qx,qy,qz,qw\n" + "".join(f"{k},0,0,0,0,0,0,1\n" for k in range(5)))
+    with pytest.raises(SourceError, match=r"--map COLUMN=t_s \(or t_ms, t_us, t_ns\)"):
+        read_foreign(tmp_path / "a.csv")
+
+
 def test_a_plain_column_goes_before_one_that_says_whose(tmp_path):
     path = _csv(tmp_path / "a.csv", "t_ns,p_x,p_y,p_z,q_x,q_y,q_z,q_w,gt_p_x", [[9.0] * N])
     np.testing.assert_allclose(read_foreign(path).trajectory.T_world_body, POSES, atol=1e-6)
