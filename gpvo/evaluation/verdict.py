@@ -116,8 +116,10 @@ def _of_motions(e: Evaluation, judged: Mapping[str, Consistency]) -> Verdict:
         if told.spans:
             where = "per motion and " * told.of_motions + f"over {_listed([n for n, _ in told.spans])}"
         headline = f"The {told.c.method} covariance is honest here, {where}"
-        if misfit:
-            return Verdict("amber", f"{headline}; but the model does not fit this run.", tuple(lines))
+        mostly_lost = 2 * e.run.log.statuses.count(Status.LOST) > len(e.run.log)
+        if misfit or mostly_lost:
+            but = "the model does not fit this run" if misfit else "most motions are lost"
+            return Verdict("amber", f"{headline}; but {but}.", tuple(lines))
         return Verdict("green", f"{headline}.", tuple(lines))
     # Of the others, gpvo publish sends those alone that the odometry states itself.
     stated = [m for m in found if m in e.run.log.methods and m != told.c.method and not found[m].wrong()]

@@ -126,6 +126,17 @@ def test_outside_the_domain_is_never_green() -> None:
     assert any(line.startswith("10 % of the frames") for line in found.lines)
 
 
+@pytest.mark.parametrize(("every", "colour"), [(3, "green"), (2, "amber")])
+def test_a_run_that_is_mostly_lost_is_never_green(every: int, colour: str) -> None:
+    evaluation = evaluated({"triangulation": 1.0})
+    log = evaluation.run.log
+    lost = [r.with_status(Status.LOST, "dark") if k % 6 > every else r for k, r in enumerate(log)]
+    lost[1] = lost[1].with_status(Status.LOST, "dark")
+    found = verdict(replace(evaluation, run=replace(evaluation.run, log=replace(log, records=lost))))
+    assert found.colour == colour
+    assert found.headline.endswith("; but most motions are lost.") == (colour == "amber")
+
+
 def test_a_model_that_does_not_fit_is_never_green() -> None:
     """Judged by its own training run, or made for another odometry: a good score says nothing of the next flight."""
     evaluation = evaluated({"learned": 1.0, "triangulation": 1.0})
