@@ -322,9 +322,10 @@ class KltFrontend:
         usual = float(np.median(row_error[np.isfinite(row_error)])) if np.isfinite(row_error).any() else 0.0
         off_row = both.inside & (np.abs(row_error - usual) > self._config.max_row_error_px)
         # Corners of noise would not be found even in a good pair.
-        sought = both.inside & (np.isfinite(row_error) | stands_out(both.seen.patches, 255 * view.stats.noise_level))
+        sought, known = both.inside.copy(), both.inside & np.isfinite(row_error)
+        missing = sought & ~known
+        sought[missing] = stands_out(both.seen.patches[missing], 255 * view.stats.noise_level)
         least_px = self._config.min_disparity_px
-        known = both.inside & np.isfinite(row_error)
         behind = known & ~off_row & (disparity < min(least_px, -KNOWN_DEPTH_PX))
         # Points at infinity have no measurable depth, which is nobody's fault; nor is what lies beyond the image.
         far = known & ~behind & (disparity < max(least_px, KNOWN_DEPTH_PX))
