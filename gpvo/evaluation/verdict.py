@@ -116,8 +116,7 @@ def _of_motions(e: Evaluation, judged: Mapping[str, Consistency]) -> Verdict:
         if told.spans:
             where = "per motion and " * told.of_motions + f"over {_listed([n for n, _ in told.spans])}"
         headline = f"The {told.c.method} covariance is honest here, {where}"
-        mostly_lost = 2 * e.run.log.statuses.count(Status.LOST) > len(e.run.log)
-        if misfit or mostly_lost:
+        if misfit or e.run.log.lost.mean() > 0.5:
             but = "the model does not fit this run" if misfit else "most motions are lost"
             return Verdict("amber", f"{headline}; but {but}.", tuple(lines))
         return Verdict("green", f"{headline}.", tuple(lines))

@@ -278,27 +278,28 @@ def test_a_vehicle_whose_stamps_jitter_does_not_leap(tmp_path):
 def test_a_frozen_image_leaves_no_doubt_of_what_follows(tmp_path):
     """Standing still is another motion than expected, but nobody believed it: its odds say nothing of the next ones.
 
-    A second after an image that froze for one, a street's sigmas had been 500 times what they were before; three times
-    now, for the doubt of the first motion after it.
+    A second after an image that froze for one, a street's sigmas had been 500 times what they were before.
     """
     source = open_source(simulate_points("street", 2, duration_s=10.0, frozen=(7.0, 8.0)).save(tmp_path / "f.npz"))
     odometry = StereoOdometry(source.camera)
     records = [odometry.step(frame) for frame in source]
     assert all(r.status is Status.LOST for r in records[70:80])
-    assert records[80].usable  # over one second, in which noisy near points may look like a second motion
-    assert all(r.status is Status.OK for r in records[81:])
+    assert all(r.status is Status.OK for r in records[80:])
     before, after = (
         max(np.sqrt(np.trace(r.covariances["triangulation"][:3, :3])) for r in records[part])
-        for part in (slice(60, 70), slice(82, 100))
+        for part in (slice(60, 70), slice(81, 100))
     )
-    assert after < 4 * before
+    assert after < 2 * before
 
 
 @pytest.mark.parametrize(
-    ("name", "with_imu", "limits"),
-    [("tunnel-clean", True, {}), ("street", False, {"max_acceleration_mps2": 12.0, "max_turn_radps2": 20.0})],
+    ("name", "with_imu", "limits", "doubted"),
+    [
+        ("tunnel-clean", True, {}, 1),  # over three seconds, a third of the usual points stay near enough to agree
+        ("street", False, {"max_acceleration_mps2": 12.0, "max_turn_radps2": 20.0}, 0),
+    ],
 )
-def test_after_three_frozen_seconds_motions_are_good(tmp_path, name, with_imu, limits):
+def test_after_three_frozen_seconds_motions_are_good(tmp_path, name, with_imu, limits, doubted):
     """All 81 (tunnel) and 15 (street) were doubtful: as if the vehicle had stood, then leapt; or, against its mean
     velocity over the three seconds, as if it had leapt now."""
     flight = simulate_points(name, 0, duration_s=14.0, frozen=(7.0, 10.0), rate_hz=20.0)
@@ -307,5 +308,5 @@ def test_after_three_frozen_seconds_motions_are_good(tmp_path, name, with_imu, l
         source.imu = None
     records = [step.record for step in steps(source, make_config(**limits))]
     assert all(r.status is Status.LOST for r in records[141:200])
-    assert records[200].usable  # over three seconds, in which few points stay near enough to agree
-    assert all(r.status is Status.OK for r in records[201:])
+    assert records[200].usable
+    assert all(r.status is Status.OK for r in records[200 + doubted :])
