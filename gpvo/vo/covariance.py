@@ -32,6 +32,7 @@ from gpvo.vo.motion import (
 )
 from gpvo.vo.points import (
     PointNoise,
+    ResidualMoments,
     no_farther_than,
     point_covariance,
     pointing_matching_pixel_covariance,
@@ -42,6 +43,8 @@ from gpvo.vo.points import (
 _MEMORY = 0.97  # of the running mean: about thirty frames
 _MOTIONS = 15  # of which the scale of the noise is the median: one bad one does not count
 _PARTS = 4, 2  # columns and rows of the image: finer ones see less of what neighbours share, coarser ones the same
+_LATELY = 0.9  # of a sum over the last motions: about ten, as long as most features are followed
+_CHANCE = 0.1  # standard deviation of what they say of noise without memory
 _CUT = 12.0  # squares of three degrees of freedom: against outliers
 _TEXTBOOK = 100.0 * np.array([[1.0, -1.0], [-1.0, 1.0]])  # prior of equal variance and covariance, worth 300 points
 # Of squares with one degree of freedom, cut off at four; of means of two, at 6.6 medians.
@@ -152,45 +155,6 @@ def covariances_by_method(
     return out
 
 
-@dataclass(frozen=True)
-class ResidualMoments:
-    """Two linear equations ``A [p^2, m^2] = sums`` for the variances of pointing and matching [px^2].
-
-    A residual's covariance is ``G S G^T + S``, ``S = diag(p^2, p^2, m^2)``: the mean square of each part is ``a p^2 + b
-    m^2``. As that of a square scatters by as much, least squares weighs it by ``1 / (a + b)^2``, near enough: after a
-    step of several baselines, most parts are all disparity's, and must not outvote the few that show pointing.
-    ``freedom``: degrees of freedom of the residuals, after six went to the motion.
-    """
-
-    A: Array
-    sums: Array
-    freedom: float
-
-    @classmethod
-    def of(cls, residuals: Array, G: Array) -> ResidualMoments:
-        """Of the residuals (M, 3) of one motion, and their derivatives (3, 3, M) by the reference measurement."""
-        by_u, by_v, by_d = (G**2 + np.eye(3)[:, :, None]).transpose(1, 0, 2)
-        by = np.stack([by_u + by_v, by_d]).reshape(2, -1)
-        weighed = 2.0 * by / by.sum(axis=0) ** 2  # at rest 1
-        freedom = max(residuals.size - 6.0, 0.0)
-        return cls(weighed @ by.T * (freedom / residuals.size), weighed @ (residuals.T**2).ravel(), freedom)
-
-    def plus(self, other: ResidualMoments, memory: float = 1.0) -> ResidualMoments:
-        """Both together, this one fading."""
-        return ResidualMoments(*(memory * a + b for a, b in zip(vars(self).values(), vars(other).values())))
-
-    @property
-    def sigmas(self) -> tuple[float, float]:
-        """(sigma_p, sigma_m) [px] that explain the residuals."""
-        p2, m2 = np.linalg.solve(self.A, self.sums)
-        # Few points tell the sum of both better than the share of each, which may come out negative.
-        least, most = _RATIO2
-        ratio2 = float(np.clip(max(p2, 0.0) / max(m2, 1e-9), least, most))
-        m_px = float(np.sqrt(max(self.sums.sum() / (self.A @ [ratio2, 1.0]).sum(), 1e-6)))
-        return m_px * ratio2**0.5, m_px
-
-
-_RATIO2 = 0.1**2, 2.0**2  # what the square of pointing over matching may be
 # To begin with 0.1 and 0.5 px, worth two points.
 _START = ResidualMoments(np.diag([8.0, 4.0]), np.array([8.0 * 0.1**2, 4.0 * 0.5**2]), 6.0)
 
@@ -227,35 +191,45 @@ class SigmaEstimator:
 
 
 class DesignEffect:
-    """How many times the variance of a motion is that of one from independent points.
+    """How many times the variance of a motion is that of one from independent points, in independent frames.
 
     L. Kish, "Survey sampling", 1965; clusters of a regression: K.-Y. Liang, S. Zeger, 1986. Points near each other
-    err alike: on one surface, or one moving object. The motion's score, summed over each of :data:`_PARTS` parts of the
-    image, then scatters more than its information says.
+    err alike, on one surface or one moving object, and may go on to do so. The motion's score, summed over each of
+    :data:`_PARTS` parts of the image, then scatters more than its information says, and still more if summed over the
+    last motions. The larger counts: noise of a point that enters two motions with opposite signs cancels in sums.
     """
 
     def __init__(self) -> None:
-        self._scatter = self._expected = 1.0
+        # Sums of scores, and the squares expected of them: up to the reference frame, and up to the last one.
+        self._before = self._lately = np.zeros((_PARTS[0] * _PARTS[1], 6)), 0.0
+        self._t_ref_ns: int | None = None
+        self._scatter, self._expected = np.ones(2), np.ones(2)
 
-    def update(self, motion: Motion, white: Whitened, camera: StereoCamera) -> None:
-        """Take in a motion and its whitened residuals."""
+    def update(self, motion: Motion, white: Whitened, camera: StereoCamera, t_ref_ns: int) -> None:
+        """Take in a motion since ``t_ref_ns``, and its whitened residuals."""
         z, A = white.z, white.A
         share = motion.uvd_prev[:, :2] / [camera.width, camera.height]
         column, row = np.clip((share * _PARTS).astype(np.int64), 0, np.array(_PARTS) - 1).T
         part = row * _PARTS[0] + column == np.arange(_PARTS[0] * _PARTS[1])[:, None]
-        scores = part @ np.einsum("ikn,in->nk", A, z)
         information = np.stack([np.einsum("ikn,iln->kl", B, B) for B in (A[..., p] for p in part)])
         covariance = np.linalg.inv(information.sum(axis=0))
         told = information @ covariance  # by each part; the motion takes the square of it off
-        variance = max(float((z**2).sum()) / max(z.size - 6.0, 1.0), 1e-12)
         expected = float(np.trace(told, axis1=1, axis2=2).sum() - (told * told.transpose(0, 2, 1)).sum())
-        self._scatter = _MEMORY * self._scatter + float(((scores @ covariance) * scores).sum()) / variance
-        self._expected = _MEMORY * self._expected + expected
+        variance = max(float((z**2).sum()) / max(z.size - 6.0, 1.0), 1e-12)
+        scores = part @ np.einsum("ikn,in->nk", A, z) @ np.linalg.cholesky(covariance) / variance**0.5
+        if t_ref_ns != self._t_ref_ns:  # of motions since one frame, only the last adds to what follows
+            self._before, self._t_ref_ns = self._lately, t_ref_ns
+        sums, squares = self._before
+        self._lately = sums, squares = _LATELY * sums + scores, _LATELY**2 * squares + expected
+        self._scatter = _MEMORY * self._scatter + [(scores**2).sum(), (sums**2).sum()]
+        self._expected = _MEMORY * self._expected + [expected, squares]
 
     @property
     def ratio(self) -> float:
-        """1 for independent points."""
-        return self._scatter / self._expected
+        """1 for independent points in independent frames."""
+        alone, lately = self._scatter / self._expected
+        excess, chance = lately - alone, 2.0 * _CHANCE * lately
+        return float(alone + (excess - chance**2 / excess if excess > chance else 0.0))
 
 
 class NoiseEstimator:

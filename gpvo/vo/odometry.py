@@ -13,11 +13,11 @@ from gpvo.geometry.covariance import lost_covariance
 from gpvo.types import Array, ImuLog, ImuMoments, Status, StereoCamera, StereoFrame, TrackFrame, VoRecord
 from gpvo.vo import opencv
 from gpvo.vo.config import KNOWN_DEPTH_PX, TELLING_PX, VoConfig
-from gpvo.vo.covariance import NoiseEstimator, ResidualMoments, SigmaEstimator, covariances_by_method
+from gpvo.vo.covariance import NoiseEstimator, SigmaEstimator, covariances_by_method
 from gpvo.vo.frontend import EMPTY, DescriptorFrontend, Followed, Frontend, Matches, TrackFrontend
 from gpvo.vo.klt import KltFrontend
 from gpvo.vo.motion import Motion, refine, whitened
-from gpvo.vo.points import triangulate
+from gpvo.vo.points import ResidualMoments, triangulate
 from gpvo.vo.quality import (
     PairWatch,
     Verdict,
@@ -314,7 +314,7 @@ class StereoOdometry:
             self._noise.update(motion, white)
         self._sigmas.update(moments)
         if self._sigmas.estimates:
-            self._sigmas.design.update(motion, white, self.camera)
+            self._sigmas.design.update(motion, white, self.camera, state.t_ref_ns)
         twists = state.moving(t_ns, motion.T_prev_cur)
         adjusted = self._window.adjust(self._raw, motion, twists)
         T_prev_cur = motion.T_prev_cur if adjusted is None else adjusted.T_ref[-1]

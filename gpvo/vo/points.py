@@ -1,4 +1,4 @@
-"""Stereo points: triangulation and the covariance of a point from that of its pixels.
+"""Stereo points: triangulation, the covariance of a point from that of its pixels, and theirs from residuals.
 
 A measurement is ``(u, v, d)``: left column, row (mean of both images) and disparity [px].
 
@@ -18,6 +18,7 @@ from gpvo.types import Array, StereoCamera
 
 # (uL, vL, uR, vR) to (u, v, d): the row is the mean of both images.
 _PIXELS_TO_UVD = np.array([[1.0, 0, 0, 0], [0, 0.5, 0, 0.5], [1.0, 0, -1.0, 0]])
+_RATIO2 = 0.1**2, 2.0**2  # what the square of pointing over matching may be
 
 
 def no_farther_than(uvd: Array, disparity_px: float) -> Array:
@@ -82,3 +83,41 @@ def point_covariance(uvd: Array, camera: StereoCamera, S_uvd: Array) -> Array:
     """Covariance (N, 3, 3) of triangulated points [m^2]: ``J S J^T``."""
     J = point_jacobian(uvd, camera)
     return J @ S_uvd @ np.swapaxes(J, -1, -2)
+
+
+@dataclass(frozen=True)
+class ResidualMoments:
+    """Two linear equations ``A [p^2, m^2] = sums`` for the variances of pointing and matching [px^2].
+
+    A residual's covariance is ``G S G^T + S``, ``S = diag(p^2, p^2, m^2)``: the mean square of each part is ``a p^2 + b
+    m^2``. As that of a square scatters by as much, least squares weighs it by ``1 / (a + b)^2``, near enough: after a
+    step of several baselines, most parts are all disparity's, and must not outvote the few that show pointing.
+    ``freedom``: degrees of freedom of the residuals, after six went to the motion.
+    """
+
+    A: Array
+    sums: Array
+    freedom: float
+
+    @classmethod
+    def of(cls, residuals: Array, G: Array) -> ResidualMoments:
+        """Of the residuals (M, 3) of one motion, and their derivatives (3, 3, M) by the reference measurement."""
+        by_u, by_v, by_d = (G**2 + np.eye(3)[:, :, None]).transpose(1, 0, 2)
+        by = np.stack([by_u + by_v, by_d]).reshape(2, -1)
+        weighed = 2.0 * by / by.sum(axis=0) ** 2  # at rest 1
+        freedom = max(residuals.size - 6.0, 0.0)
+        return cls(weighed @ by.T * (freedom / residuals.size), weighed @ (residuals.T**2).ravel(), freedom)
+
+    def plus(self, other: ResidualMoments, memory: float = 1.0) -> ResidualMoments:
+        """Both together, this one fading."""
+        return ResidualMoments(*(memory * a + b for a, b in zip(vars(self).values(), vars(other).values())))
+
+    @property
+    def sigmas(self) -> tuple[float, float]:
+        """(sigma_p, sigma_m) [px] that explain the residuals."""
+        p2, m2 = np.linalg.solve(self.A, self.sums)
+        # Few points tell the sum of both better than the share of each, which may come out negative.
+        least, most = _RATIO2
+        ratio2 = float(np.clip(max(p2, 0.0) / max(m2, 1e-9), least, most))
+        m_px = float(np.sqrt(max(self.sums.sum() / (self.A @ [ratio2, 1.0]).sum(), 1e-6)))
+        return m_px * ratio2**0.5, m_px

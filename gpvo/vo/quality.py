@@ -17,10 +17,10 @@ from gpvo.geometry import se3
 from gpvo.stats.series import median
 from gpvo.types import Array, Status, StereoCamera
 from gpvo.vo.config import KNOWN_DEPTH_PX, TELLING_PX, VoConfig
-from gpvo.vo.covariance import ResidualMoments
 from gpvo.vo.frontend import Matches, Observation, RightSearch
 from gpvo.vo.motion import Motion, predict_uvd, within
 from gpvo.vo.opencv import ImageStats
+from gpvo.vo.points import ResidualMoments
 
 _ENOUGH_FOR_SIGMAS = 8  # points
 _MEMORY = 0.8  # of the running sums: about five frames

@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+
 import numpy as np
 import pytest
 from gpvo.geometry import se3
-from gpvo.vo.covariance import DesignEffect, NoiseEstimator, ResidualMoments, SigmaEstimator, motion_covariance
+from gpvo.types import Array
+from gpvo.vo.covariance import DesignEffect, NoiseEstimator, SigmaEstimator, motion_covariance
 from gpvo.vo.motion import refine, transfer, whitened
-from gpvo.vo.points import PointNoise, pointing_matching_pixel_covariance
+from gpvo.vo.points import PointNoise, ResidualMoments, pointing_matching_pixel_covariance
 from stereo_points import CAMERA, noisy, scene
 
 
@@ -115,7 +118,7 @@ def test_points_that_err_alike_count_as_fewer(shared_px: float, least: float, mo
         motion = refine(T, before, after, CAMERA)
         assert motion is not None
         white = whitened(motion, CAMERA)
-        design.update(motion, white, CAMERA)
+        design.update(motion, white, CAMERA, k)
         sigmas.update(ResidualMoments.of(motion.residuals, white.moved.G))
         if k >= 20:
             S = pointing_matching_pixel_covariance(*np.multiply(sigmas.values, design.ratio**0.5))
@@ -123,3 +126,40 @@ def test_points_that_err_alike_count_as_fewer(shared_px: float, least: float, mo
             scores.append(e @ np.linalg.solve(motion_covariance(motion.T_prev_cur, motion.uvd_prev, CAMERA, S).full, e))
     assert least < design.ratio < most
     assert 0.7 < np.mean(scores) / 6 < 1.5
+
+
+def _flight(rng: np.random.Generator, kept: float, count: int, reference: Callable[[int], int]) -> tuple[Array, Array]:
+    """Errors (count, 6) of motions whose points err alike in each eighth of the image, by 0.15 px, of which a share
+    ``kept`` is left in the next motion; and the covariance (6, 6) stated for each."""
+    design, sigmas, shared, out = DesignEffect(), SigmaEstimator(None, None), np.zeros((8, 3)), []
+    for k in range(count):
+        T, before, after = scene(rng, 150, (8.0, 60.0))
+        part = (before[:, 0] // 160 + 4 * (before[:, 1] // 240)).astype(int)
+        shared = kept * shared + (1.0 - kept**2) ** 0.5 * 0.15 * rng.standard_normal((8, 3))
+        motion = refine(T, noisy(rng, before, 0.15), noisy(rng, after, 0.15) + shared[part], CAMERA)
+        assert motion is not None
+        white = whitened(motion, CAMERA)
+        design.update(motion, white, CAMERA, reference(k))
+        sigmas.update(ResidualMoments.of(motion.residuals, white.moved.G))
+        S = pointing_matching_pixel_covariance(*np.multiply(sigmas.values, design.ratio**0.5))
+        C = motion_covariance(motion.T_prev_cur, motion.uvd_prev, CAMERA, S).full
+        out.append((se3.log(se3.inverse(T) @ motion.T_prev_cur), C))
+    errors, C = zip(*out, strict=True)
+    return np.array(errors), np.array(C)
+
+
+def test_points_that_go_on_to_err_alike_count_as_fewer_still() -> None:
+    """Over ten motions, twenty times in each of four flights; by single motions alone, NEES/dof would be 3.6."""
+    nees = []
+    for seed in range(4):
+        errors, C = _flight(np.random.default_rng(seed), 0.8, 220, lambda k: k)
+        sums, stated = errors[20:].reshape(20, 10, 6).sum(1), C[20:].reshape(20, 10, 6, 6).sum(1)
+        nees.append(np.einsum("bi,bi->b", sums, np.linalg.solve(stated, sums[..., None])[..., 0]).mean() / 6)
+    assert 0.7 < np.mean(nees) < 1.4
+
+
+def test_motions_since_one_frame_do_not_add_up() -> None:
+    """They share its noise, as a camera at rest sees: that is one error, counted once."""
+    _, moving = _flight(np.random.default_rng(0), 0.9, 60, lambda k: k)
+    _, resting = _flight(np.random.default_rng(0), 0.9, 60, lambda k: 0)
+    assert np.trace(moving[-1]) > 2.0 * np.trace(resting[-1])
