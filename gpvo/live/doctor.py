@@ -12,7 +12,7 @@ import threading
 import time
 from collections import Counter
 from collections.abc import Iterable, Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -99,6 +99,11 @@ class Stated:
         t_ns = np.array([stamp_ns(m) for m in kept], dtype=np.int64)
         return cls(t_ns, T, norm, tuple(frames), pose, twist, None if v is None else np.array(v))
 
+    def dated(self) -> Stated:
+        """The messages with a stamp: one without would begin or end a motion of decades."""
+        rows = {name: value[self.t_ns != 0] for name, value in vars(self).items() if isinstance(value, np.ndarray)}
+        return replace(self, **rows)
+
 
 def _twist(message: Any) -> list[float]:
     a, b = message.twist.twist.linear, message.twist.twist.angular
@@ -142,13 +147,14 @@ def examine_topic(
 
 def examine(stated: Stated) -> list[Finding]:
     """Everything that is wrong with a recording, worst first; empty for a good one."""
-    motions = _motions(stated)
+    dated = stated.dated()
+    motions = _motions(dated)
     found = [*_stamps(stated), *_frames(stated), *_poses(stated), *(_jumps(*motions[1:]) if motions else ())]
     if stated.pose is None and stated.twist is None:
         found.append(Finding("no-covariance", "the message type has no covariance", _PX4_FLOOR))
     for name, C in (("pose", stated.pose), ("twist", stated.twist)):
         found += () if C is None else _matrices(name, C)
-    return [*found, *(_pose_against_twist(stated, *motions) if motions else ())]
+    return [*found, *(_pose_against_twist(dated, *motions) if motions else ())]
 
 
 def _matrices(name: str, C: Array) -> Iterator[Finding]:
@@ -190,15 +196,13 @@ def _matrices(name: str, C: Array) -> Iterator[Finding]:
 
 
 def _stamps(s: Stated) -> Iterator[Finding]:
-    steps = np.diff(s.t_ns)
-    if (unset := s.t_ns == 0).any():
-        text = "every consumer dates the measurement to the epoch and drops it"
-        yield from Finding.where(unset, "stamp-zero", "stamps are zero", text)
-    else:
-        text = "robot_localization drops or replays them; PX4 and ArduPilot use them as they are"
-        yield from Finding.where(steps < 0, "stamp-backward", "stamps go backward", text)
-        text = "the same measurement is fused twice: the filter becomes overconfident"
-        yield from Finding.where(steps == 0, "stamp-repeated", "stamps repeat", text)
+    text = "every consumer dates the measurement to the epoch and drops it"
+    yield from Finding.where(s.t_ns == 0, "stamp-zero", "stamps are zero", text)
+    steps = np.diff(s.t_ns[s.t_ns != 0])
+    text = "robot_localization drops or replays them; PX4 and ArduPilot use them as they are"
+    yield from Finding.where(steps < 0, "stamp-backward", "stamps go backward", text)
+    text = "the same measurement is fused twice: the filter becomes overconfident"
+    yield from Finding.where(steps == 0, "stamp-repeated", "stamps repeat", text)
     good = steps[steps > 0]
     if len(good) and good.max() > 10 * np.median(good):
         what = f"a gap of {good.max() * 1e-9:.2f} s, at {1e9 / np.median(good):.0f} Hz"

@@ -137,6 +137,15 @@ def test_a_seeded_fault_is_found(code: str, good: list[Odometry], tmp_path: Path
     assert found[code]["consequence"]
 
 
+def test_a_message_without_a_stamp_hides_nothing_and_is_no_gap(good: list[Odometry], tmp_path: Path) -> None:
+    """Its place in the bag tells when it came: the others are judged as if it were not there."""
+    for order in (1, -1):
+        frames = [replace(o, t_ns=0) if k % 40 == 20 else o for k, o in enumerate(good)]
+        frames[65:67] = frames[65:67][::order]
+        found = {f.code for f in examine_bag(bag_of(frames, tmp_path / str(order)))[TOPIC]}
+        assert found == {"stamp-zero"} | ({"stamp-backward"} if order < 0 else set())
+
+
 def _truth_of(seed: int, path: Path) -> Path:
     """Of the body, in a world of its own."""
     stamps, _ = flight(seed=seed, n=N)
