@@ -190,6 +190,9 @@ class SequenceOptions(ViewOptions):
     calibration: Annotated[Path | None, "Calibration file to use instead of the one found."] = None
     left_topic: Annotated[str | None, "Topic of the left images in a bag."] = None
     right_topic: Annotated[str | None, "Topic of the right images in a bag."] = None
+    base_frame: Annotated[
+        str | None, "Robot frame of which gpvo publish is to speak, located through /tf_static and /tf of a bag."
+    ] = None
     rate_hz: Annotated[float | None, "Frame rate of an image folder whose file names are numbers."] = None
     imu_topic: Annotated[str | None, "Topic of the IMU in a bag."] = None
     truth_topic: Annotated[str | None, "Topic of the ground truth in a bag; none to ignore it."] = None

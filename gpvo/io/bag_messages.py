@@ -18,7 +18,7 @@ from gpvo.geometry import se3
 from gpvo.io.bag_reader import POSE_TYPES, messages, open_bag, stamp_ns, topics_of
 from gpvo.io.source import Depth, SourceReport
 from gpvo.io.stamps import BACK_NS, PAIR_TOLERANCE_S, Stamps, astray, no_pair, reach_ns, steps_ns
-from gpvo.io.trajectory import make_imu
+from gpvo.io.trajectory import FARTHEST_M, make_imu
 from gpvo.stats.series import interpolated
 from gpvo.types import Array, ImuLog
 
@@ -40,6 +40,8 @@ _LUMA = {
 # Pairs arrive within a few messages of one another; beyond that a message has lost its partner.
 _WAITING = 12
 _ENOUGH = 8  # intervals, of both cameras, that tell the usual one
+_MOST_FRAMES = 1000
+_MOVED_M, _MOVED_RAD = 5e-3, 5e-3
 _LEAST_LEFT = 0.9  # of the messages of a topic of poses, without those that repeat a stamp
 
 
@@ -161,6 +163,63 @@ def pose_of(message: Any) -> Array:
         pose = message.pose.pose if hasattr(message.pose, "pose") else message.pose
         p, q = pose.position, pose.orientation
     return np.array([p.x, p.y, p.z, q.x, q.y, q.z, q.w], dtype=np.float64)
+
+
+def read_pose(message: Any, farthest_m: float = FARTHEST_M) -> Array | None:
+    """The pose or transform (4, 4) of a message; None where it is not finite, too far away, or no rotation."""
+    row = pose_of(message)
+    norm = float(np.linalg.norm(row[3:]))
+    # Comparisons with NaN are false.
+    if not (np.abs(row[:3]).max() <= farthest_m and abs(norm - 1.0) <= 0.1):
+        return None
+    return se3.from_quaternion(row[:3], row[3:] / norm)
+
+
+def frame_name(name: object) -> str:
+    """Of a frame, without ROS 1's leading slash."""
+    return str(name).removeprefix("/")
+
+
+class FrameTree:
+    """The tree of frames in ``tf2_msgs/TFMessage``; of each frame the newest place on its parent holds.
+
+    ``refused``: how many transforms were not finite, no rotation, or of a frame on itself.
+    """
+
+    def __init__(self) -> None:
+        self.refused = 0
+        self._places: dict[str, tuple[str, Array]] = {}  # child: parent, T_parent_child
+
+    def take(self, message: Any) -> None:
+        """The transforms of one message."""
+        for transform in message.transforms:
+            parent, child = frame_name(transform.header.frame_id), frame_name(transform.child_frame_id)
+            T_parent_child = read_pose(transform)
+            is_full = child not in self._places and len(self._places) >= _MOST_FRAMES
+            if T_parent_child is None or parent == child or is_full:
+                self.refused += 1
+            else:
+                self._places[child] = (parent, T_parent_child)
+
+    def transform(self, target: str, source: str) -> Array | None:
+        """T_target_source (4, 4); None where no chain of transforms joins the two frames."""
+        to_target, to_source = self._ancestors(target), self._ancestors(source)
+        common = next((name for name in to_target if name in to_source), None)
+        return None if common is None else se3.inverse(to_target[common]) @ to_source[common]
+
+    def _ancestors(self, name: str) -> dict[str, Array]:
+        """The frame itself and all above it, nearest first, with T_ancestor_frame."""
+        T, out = np.eye(4), {name: np.eye(4)}
+        while name in self._places and self._places[name][0] not in out:
+            name, T_parent = self._places[name]
+            out[name] = T = T_parent @ T
+        return out
+
+
+def has_moved(T_a: Array, T_b: Array) -> bool:
+    """Whether a mounting (4, 4) is another than it was, beyond rounding and a calibration that is refined."""
+    change = np.abs(se3.log(se3.inverse(T_a) @ T_b))
+    return bool(change[:3].max() > _MOVED_M or change[3:].max() > _MOVED_RAD)
 
 
 def covariances_of(messages: Sequence[Any], name: str) -> Array | None:

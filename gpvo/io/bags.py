@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import re
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import islice
 from pathlib import Path
 from typing import Any
@@ -14,14 +14,27 @@ import numpy as np
 from gpvo.cameras.kalibr import camchain_topics
 from gpvo.cameras.readers import SIDES, CameraInfo, find_calibration, read_stereo_yaml, rig_from_camera_info
 from gpvo.cameras.rig import StereoRig
-from gpvo.errors import CalibrationError, SourceError
-from gpvo.io.bag_messages import decode_message, encoding_of, imu_topics, pair_streams, read_imu, read_poses
+from gpvo.errors import CalibrationError, SourceError, printable
+from gpvo.io.bag_messages import (
+    FrameTree,
+    decode_message,
+    encoding_of,
+    frame_name,
+    has_moved,
+    imu_topics,
+    pair_streams,
+    read_imu,
+    read_poses,
+)
 from gpvo.io.bag_reader import (
     IMAGE_TYPES,
     IMU_TYPE,
     INFO_TYPE,
     ODOMETRY_TYPE,
     POSE_TYPES,
+    TF_STATIC,
+    TF_TOPICS,
+    TF_TYPE,
     is_bag,
     messages,
     open_bag,
@@ -32,9 +45,10 @@ from gpvo.io.images import Image8, ImageSource, check_size
 from gpvo.io.source import SourceReport
 from gpvo.io.stamps import PAIR_TOLERANCE_S, tolerance_ns, usual_interval
 from gpvo.io.trajectory import MOTION_CAPTURE, UNKNOWN, Trajectory, carry, check_overlap
-from gpvo.types import TruthLog
+from gpvo.types import Array, TruthLog
 
 _CAPTURE_NAMES = ("vicon", "mocap", "optitrack", "vrpn", "qualisys")
+_BASE = "base_link"
 
 
 @dataclass(frozen=True)
@@ -55,7 +69,8 @@ class BagSource(ImageSource):
     ``imu_topic`` and ``truth_topic`` (``"none"`` for no truth) override. Stamps of a pair may differ by
     ``tolerance_s``. ``truth_frame`` (``"imu"`` or ``"cam"``) says whose poses the truth topic holds: the IMU's where
     its place is known, unless stated. Poses of motion capture are guessed to be the truth only with ``truth_frame``:
-    its markers rarely sit where the IMU does. ``bits`` is the depth of the samples in 16-bit images.
+    its markers rarely sit where the IMU does. ``bits`` is the depth of the samples in 16-bit images. ``base_frame``:
+    the robot's frame that becomes the body, located through /tf_static and /tf from that of the left images.
     """
 
     format = "rosbag"
@@ -69,6 +84,7 @@ class BagSource(ImageSource):
         imu_topic: str | None = None,
         truth_topic: str | None = None,
         truth_frame: str | None = None,
+        base_frame: str | None = None,
         tolerance_s: float = PAIR_TOLERANCE_S,
         calibration: str | Path | None = None,
         **options: Any,
@@ -86,6 +102,8 @@ class BagSource(ImageSource):
         super().__init__(path, path.stem if path.is_file() else path.resolve().name, rig, **options)
         self.span_ns = span = _span(first, self._topics.count)
         self._tolerance_ns = tolerance_ns(tolerance_s)
+        if base_frame is not None or self.mounting.T_body_cam is None:
+            self._place(base_frame)
         self.imu = read_imu(path, self._topics.imu, rig.timeshift_cam_imu_s, self.remark)
         if self.imu is not None and (self.imu.t_ns[0] > span[1] or self.imu.t_ns[-1] < span[0]):
             self.remark("the IMU does not overlap the images in time, so it says nothing of them: two clocks?")
@@ -118,6 +136,24 @@ class BagSource(ImageSource):
             for t_ns, left, right in pair_streams(stream, topics.left, self._tolerance_ns, report, self.path):
                 yield t_ns, decode_message(left, self.depth), decode_message(right, self.depth)
 
+    def _place(self, base: str | None) -> None:
+        """Take ``base`` for the body; without one, say so where the bag places its camera on a base_link."""
+        with open_bag(self.path) as reader:
+            _, image = next(messages(reader, [self._topics.left], lambda _: None))
+            camera = frame_name(image.header.frame_id)
+            if base is None:
+                if _place_of(reader, _BASE, camera, (TF_STATIC,), self.path) is not None:
+                    what = f"{TF_STATIC} says where the camera sits on '{_BASE}', which is not used"
+                    self.remark(f"{what}: with --base-frame {_BASE} it is what 'gpvo publish' speaks of")
+                return
+            T_base_camera = _place_of(reader, frame_name(base), camera, TF_TOPICS, self.path)
+        if T_base_camera is None:
+            told = f"no transform on {' or '.join(TF_TOPICS)} joins '{printable(base)}' to '{printable(camera)}'"
+            cure = "name a frame that they join to it, or leave out --base-frame"
+            raise SourceError(f"{told}, the frame of the left images", where=self.path, cure=cure)
+        place = T_base_camera @ self.rectifier.T_left_cam
+        self.mounting = replace(self.mounting, T_body_cam=place, body=frame_name(base))
+
     def _read_truth(self, topic: str, frame: str | None) -> TruthLog:
         try:
             t, T, _ = read_poses(self.path, topic, self.remark, complete=True)
@@ -134,6 +170,23 @@ class BagSource(ImageSource):
         truth = carry(Trajectory(t, T), place, MOTION_CAPTURE if _is_capture(topic) else UNKNOWN)
         check_overlap(truth, self.span_ns, self.path)
         return truth
+
+
+def _place_of(reader: Any, base: str, camera: str, topics: tuple[str, ...], path: Path) -> Array | None:
+    """T_base_camera (4, 4) by the transforms in a bag, None where they do not join the two.
+
+    Raises SourceError where it changes: a mounting is rigid.
+    """
+    tree, place = FrameTree(), np.eye(4) if base == camera else None
+    if known := [t for t in topics if t in topics_of(reader, (TF_TYPE,))]:
+        for _, message in messages(reader, known):
+            tree.take(message)
+            now = tree.transform(base, camera)
+            if place is not None and now is not None and has_moved(place, now):
+                told = f"the transform from '{printable(base)}' to '{printable(camera)}' changes"
+                raise SourceError(told, where=path, cure="name a frame that is rigidly joined to the camera")
+            place = now if place is None else place
+    return place
 
 
 def _choose_topics(

@@ -295,7 +295,8 @@ def _read_rig(path: Path) -> tuple[StereoCamera | None, Mounting]:
         with _guarded(path):
             raw = document.get("camera")
             camera = None if raw is None else StereoCamera(**{k: raw[k] for k in field_names(StereoCamera)})
-            return camera, Mounting(T_body_cam=pose("T_body_cam"), T_imu_cam=pose("T_imu_cam"))
+            body = printable(document.get("body", "base_link"))
+            return camera, Mounting(pose("T_body_cam"), pose("T_imu_cam"), body)
     except CalibrationError as problem:
         raise SourceError(problem.what, where=path) from None
 

@@ -16,6 +16,9 @@ from gpvo.io.bag_reader import (
     IMAGE_TYPES,
     IMU_TYPE,
     INFO_TYPE,
+    TF_STATIC,
+    TF_TOPICS,
+    TF_TYPE,
     open_bag,
 )
 from gpvo.io.bags import has_word, info_topic
@@ -24,7 +27,7 @@ from gpvo.live.engine import Engine, Output
 from gpvo.live.intake import Arrival, Mailbox, arrivals, odometry_topic, replay
 from gpvo.live.late_truth import LateTruth
 from gpvo.live.outputs import FileOutput, MavlinkOutput, Px4Output, Wire, WireOutput, decode
-from gpvo.live.stages import TF_STATIC, TF_TOPICS, TF_TYPE, BaseFrameStage, PoseStage, Stage
+from gpvo.live.stages import BaseFrameStage, PoseStage, Stage
 from gpvo.live.stereo_stage import StereoSettings, StereoStage
 from gpvo.online.predictor import Predictor
 from gpvo.parallel import after_first, ending_signals

@@ -10,9 +10,10 @@ import numpy as np
 
 from gpvo.dataset.errors import interpolation_sigma, motion_targets
 from gpvo.geometry.covariance import is_positive_definite
+from gpvo.io.bag_messages import read_pose
 from gpvo.io.bag_reader import stamp_ns
 from gpvo.live.intake import Sequence, StampWatch
-from gpvo.live.stages import read_pose, stated_covariance
+from gpvo.live.stages import stated_covariance
 from gpvo.types import Array, Prediction, TruthLog, VoRecord
 
 _MOTIONS, _POSES = 500, 5000

@@ -13,8 +13,8 @@ from typing import Any
 from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
 from gpvo.errors import GpvoError
+from gpvo.io.bag_reader import TF_TYPE
 from gpvo.live.outputs import Send
-from gpvo.live.stages import TF_TYPE
 
 _DEPTH, _KEPT = 10, 100
 

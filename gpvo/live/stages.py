@@ -23,11 +23,10 @@ from gpvo.geometry.covariance import (
     symmetrise,
 )
 from gpvo.geometry.se3 import T_FLU_OPTICAL
-from gpvo.io.bag_messages import pose_of
-from gpvo.io.bag_reader import stamp_ns
+from gpvo.io.bag_messages import FrameTree, frame_name, has_moved, read_pose
+from gpvo.io.bag_reader import TF_TOPICS, stamp_ns
 from gpvo.io.foreign import definite_in_plane, into_body, is_optical, moving_frame
 from gpvo.io.stated import is_turn_unknown
-from gpvo.io.trajectory import FARTHEST_M
 from gpvo.live.intake import CONFIRM, Arrival, Sequence, StampWatch
 from gpvo.stats.consistency import SEEN
 from gpvo.stats.series import Doubt
@@ -35,11 +34,6 @@ from gpvo.types import IMPORTED, IMPORTED_POSE, Array, Status, StereoCamera, VoR
 
 _MAX_M, _MAX_MPS, _MAX_RADPS = 1e7, 300.0, 50.0
 _ENOUGH, _GROWS = 20, 0.95
-TF_TYPE = "tf2_msgs/msg/TFMessage"
-TF_STATIC = "/tf_static"
-TF_TOPICS = ("/tf", TF_STATIC)
-_MOST_FRAMES = 1000
-_MOVED_M, _MOVED_RAD = 5e-3, 5e-3
 
 
 @dataclass(frozen=True)
@@ -221,16 +215,6 @@ class PoseStage:
         return symmetrise(change_body(self._T_cam_body, C)) if is_positive_definite(C) else None
 
 
-def read_pose(message: Any, farthest_m: float = FARTHEST_M) -> Array | None:
-    """The pose or transform (4, 4) of a message; None where it is not finite, too far away, or no rotation."""
-    row = pose_of(message)
-    norm = float(np.linalg.norm(row[3:]))
-    # Comparisons with NaN are false.
-    if not (np.abs(row[:3]).max() <= farthest_m and abs(norm - 1.0) <= 0.1):
-        return None
-    return se3.from_quaternion(row[:3], row[3:] / norm)
-
-
 def stated_covariance(holder: Any) -> Array | None:
     """The (6, 6) covariance of a PoseWithCovariance or TwistWithCovariance, zeros too; None where it is not one."""
     flat = getattr(holder, "covariance", None)
@@ -247,42 +231,6 @@ def lost(record: VoRecord, duration_s: float, covariance: Array, method: str) ->
     return VoRecord(record.t_ns, t_prev_ns, Status.LOST, np.eye(4), reason=reason, covariances=stated)
 
 
-class FrameTree:
-    """The tree of frames in ``tf2_msgs/TFMessage``; of each frame the newest place on its parent holds.
-
-    ``refused``: how many transforms were not finite, no rotation, or of a frame on itself.
-    """
-
-    def __init__(self) -> None:
-        self.refused = 0
-        self._places: dict[str, tuple[str, Array]] = {}  # child: parent, T_parent_child
-
-    def take(self, message: Any) -> None:
-        """The transforms of one message."""
-        for transform in message.transforms:
-            parent, child = _frame_name(transform.header.frame_id), _frame_name(transform.child_frame_id)
-            T_parent_child = read_pose(transform)
-            is_full = child not in self._places and len(self._places) >= _MOST_FRAMES
-            if T_parent_child is None or parent == child or is_full:
-                self.refused += 1
-            else:
-                self._places[child] = (parent, T_parent_child)
-
-    def transform(self, target: str, source: str) -> Array | None:
-        """T_target_source (4, 4); None where no chain of transforms joins the two frames."""
-        to_target, to_source = self._ancestors(target), self._ancestors(source)
-        common = next((name for name in to_target if name in to_source), None)
-        return None if common is None else se3.inverse(to_target[common]) @ to_source[common]
-
-    def _ancestors(self, name: str) -> dict[str, Array]:
-        """The frame itself and all above it, nearest first, with T_ancestor_frame."""
-        T, out = np.eye(4), {name: np.eye(4)}
-        while name in self._places and self._places[name][0] not in out:
-            name, T_parent = self._places[name]
-            out[name] = T = T_parent @ T
-        return out
-
-
 class BaseFrameStage:
     """A stage whose odometry is that of the frame ``base``, which sits rigidly on the frame that the source names.
 
@@ -292,7 +240,7 @@ class BaseFrameStage:
     """
 
     def __init__(self, inner: Stage, base: str) -> None:
-        self.inner, self.base, self.topic = inner, _frame_name(base), inner.topic
+        self.inner, self.base, self.topic = inner, frame_name(base), inner.topic
         self.counts: Counter[str] = inner.counts
         self.method = inner.method
         self._tree = FrameTree()
@@ -363,8 +311,8 @@ class BaseFrameStage:
         self._is_nameless = named is None
         if named is None:
             return False
-        if self._T_base_source is None or _frame_name(named) != self._source:
-            self._source, self._has_moved = _frame_name(named), False
+        if self._T_base_source is None or frame_name(named) != self._source:
+            self._source, self._has_moved = frame_name(named), False
             self._T_base_source = self._tree.transform(self.base, self._source)
         return self._T_base_source is not None
 
@@ -373,16 +321,10 @@ class BaseFrameStage:
             return
         now = self._tree.transform(self.base, self._source)
         if now is not None:
-            change = np.abs(se3.log(se3.inverse(self._T_base_source) @ now))
-            self._has_moved = bool(change[:3].max() > _MOVED_M or change[3:].max() > _MOVED_RAD)
+            self._has_moved = has_moved(self._T_base_source, now)
 
     def _of_base(self, taken: Taken) -> Taken:
         T = taken.T_parent_body
         if T is not None and self._T_base_source is not None:
             T = T @ se3.inverse(self._T_base_source)
         return replace(taken, T_parent_body=T, child_frame_id=self.base)
-
-
-def _frame_name(name: object) -> str:
-    """Of a frame, without ROS 1's leading slash."""
-    return str(name).removeprefix("/")

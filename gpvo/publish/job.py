@@ -23,13 +23,18 @@ from gpvo.types import Prediction
 
 TARGETS = ("bag", "mcap", "mavlink")
 _PARAMETERS = (b"^# robot_localization fed by gpvo", "file of parameters")
+_UNPLACED = (
+    "base_link here is the left camera, x ahead: the run does not know where it sits on a body (gpvo run BAG "
+    "--base-frame NAME); the filter must be told, or the camera look straight ahead"
+)
 _SUFFIXES = {".bag": "bag", ".mcap": "mcap", ".tlog": "mavlink"}
 
 
 @dataclass(frozen=True)
 class Published:
     """What was written, and what the consumer will make of it. ``outside``: frames with a motion that are marked by a
-    MAVLink quality of -1 as far outside the model's domain; ArduPilot refuses them."""
+    MAVLink quality of -1 as far outside the model's domain; ArduPilot refuses them. ``is_placed``: whether the run
+    knows where the camera sits on the body; if not, ``base_link`` is the left camera, x ahead."""
 
     run: str
     to: str | None
@@ -39,6 +44,7 @@ class Published:
     outside: int
     source: str
     consumer: str | None
+    is_placed: bool
     verdicts: Sequence[consumers.Verdict]
 
     def document(self) -> dict[str, Any]:
@@ -51,6 +57,8 @@ class Published:
         head = f"{written}, covariance from {self.source}, {counted(self.lost, 'lost frame')}"
         if self.outside:
             head += f", {self.outside} far outside the model's domain (MAVLink quality -1: ArduPilot refuses them)"
+        if not self.is_placed:
+            head += f"\n{_UNPLACED}"
         return "\n".join([head, *(f"{self.consumer} {v}" for v in self.verdicts)])
 
 
@@ -79,7 +87,8 @@ def publish_run(path: Path, settings: PublishSettings) -> Published:
     lost = sum(not o.tracked for o in odometry)
     outside = sum(mavlink.quality(o) < 0 for o in odometry) - lost
     asked = consumer if settings.check else None
-    return Published(run.name, settings.to, out, count, lost, outside, source, asked, verdicts)
+    placed = run.mounting.T_body_cam is not None
+    return Published(run.name, settings.to, out, count, lost, outside, source, asked, placed, verdicts)
 
 
 def odometry_of(run: Run, predictions: Mapping[int, Prediction], settings: PublishSettings) -> list[Odometry]:
@@ -88,8 +97,9 @@ def odometry_of(run: Run, predictions: Mapping[int, Prediction], settings: Publi
     if usable and not predictions and not any(r.covariances for r in run.log if r.usable):
         raise GpvoError("holds neither predictions nor covariances", where=run.path, cure="give --model")
     builder = OdometryBuilder(T_body_cam=run.mounting.T_body_cam, method=settings.method)
+    body = run.mounting.body
     try:
-        return list(messages(run.log, predictions, builder))
+        return [replace(o, child_frame_id=body) for o in messages(run.log, predictions, builder)]
     except GpvoError as error:
         raise GpvoError(error.what, where=run.path, cure=error.cure) from None
 
@@ -161,7 +171,9 @@ def _write(run: Run, odometry: Sequence[Odometry], settings: PublishSettings) ->
     kind = ros.kind_of(out, settings.to)
     count = ros.write_bag(out, odometry, settings.topic, kind)
     rate_hz = 1.0 / float(np.median(np.diff([o.t_ns for o in odometry])) * 1e-9)
-    text = ros.robot_localization_yaml(settings.topic, rate_hz=max(30.0, rate_hz), ros1=kind == "ros1")
+    text = ros.robot_localization_yaml(
+        settings.topic, rate_hz=max(30.0, rate_hz), ros1=kind == "ros1", base=odometry[0].child_frame_id
+    )
     write_text(_parameters(out), text, own=_PARAMETERS)
     return str(out), count
 

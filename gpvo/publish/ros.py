@@ -172,7 +172,9 @@ def _holds_only(bag: Path, topic: str) -> bool:
         return False
 
 
-def robot_localization_yaml(topic: str = TOPIC, *, rate_hz: float = 30.0, ros1: bool = False) -> str:
+def robot_localization_yaml(
+    topic: str = TOPIC, *, rate_hz: float = 30.0, ros1: bool = False, base: str = "base_link"
+) -> str:
     """Parameters for robot_localization that use the twist alone, as its manual advises for odometry.
 
     The pose of an odometry is its integrated twist: fusing both would count one measurement twice. ``ros1``: for
@@ -181,7 +183,7 @@ def robot_localization_yaml(topic: str = TOPIC, *, rate_hz: float = 30.0, ros1: 
     row = "false, false, false"
     use = "true,  true,  true "
     head = f"""# robot_localization fed by gpvo: body twist with its full covariance.
-# gpvo publishes {topic} in odom -> base_link and broadcasts no transform; this node does.
+# gpvo publishes {topic} in odom -> {base} and broadcasts no transform; this node does.
 """
     parameters = f"""frequency: {rate_hz:.1f}
 sensor_timeout: 0.2

@@ -157,11 +157,12 @@ MOST_RADPS, MOST_MPS2 = 30.0, 150.0
 class Mounting:
     """Where the rectified left camera sits: ``T_body_cam`` and ``T_imu_cam`` (4, 4), None where unknown.
 
-    ``body`` is FLU ``base_link``.
+    ``body`` is FLU ``base_link``, or the robot's frame that is named.
     """
 
     T_body_cam: Array | None = None
     T_imu_cam: Array | None = None
+    body: str = "base_link"
 
 
 @dataclass(frozen=True)

@@ -48,6 +48,41 @@ def test_stereo_bag(tmp_path, kind):
     assert source.truth.sigma_rotation_rad == 8e-4
 
 
+def _placed(tmp_path, *topics):
+    """A bag whose transforms, one message for each topic, place its camera on base_link by (4, 4) each."""
+    maker = stereo_bag(False)
+    for k, (topic, T) in enumerate(topics):
+        parts = BagMaker(False)
+        parts.transform("/", 0, T, "base_link", "head")
+        parts.transform("/", 0, PLACE, "head", "cam")
+        t_ns = seq.stamps(12)[k]
+        maker.add(topic, maker.type("tf2_msgs/msg/TFMessage")([m for _, _, m in parts.messages]), t_ns)
+    return maker.write(tmp_path / f"{len(topics)}")
+
+
+PLACE = se3.exp(np.array([0.1, 0.0, -0.05, -1.2, 1.2, -1.1]))
+TILTED = se3.exp(np.array([0.2, 0.03, 0.1, 0.0, 0.4, 0.0]))
+
+
+def test_the_body_is_the_frame_that_is_named_and_one_that_is_not_asked_for_is_told(tmp_path):
+    path = _placed(tmp_path, ("/tf_static", TILTED), ("/tf", TILTED))
+    mounting = open_source(path, base_frame="base_link").mounting
+    np.testing.assert_allclose(mounting.T_body_cam, TILTED @ PLACE, atol=1e-12)
+    np.testing.assert_allclose(open_source(path, base_frame="/head").mounting.T_body_cam, PLACE, atol=1e-12)
+    plain = open_source(path)
+    assert plain.mounting.T_body_cam is None
+    assert "--base-frame base_link" in " ".join(plain.report.notes)
+    assert not open_source(_write(tmp_path, "mcap")).report.notes[1:]
+    with pytest.raises(SourceError, match="joins 'mast' to 'cam'"):
+        open_source(path, base_frame="mast")
+
+
+def test_a_body_that_the_camera_turns_on_is_refused(tmp_path):
+    path = _placed(tmp_path, ("/tf_static", TILTED), ("/tf", TILTED @ TILTED))
+    with pytest.raises(SourceError, match="from 'base_link' to 'cam' changes"):
+        open_source(path, base_frame="base_link")
+
+
 def test_single_storage_files(tmp_path):
     folder = _write(tmp_path, "mcap")
     assert len(seq.frames_of(open_source(next(folder.glob("*.mcap"))))) == 12

@@ -13,13 +13,14 @@ from bag_maker import BagMaker, stereo_bag
 from gpvo.errors import GpvoError
 from gpvo.geometry import se3
 from gpvo.geometry.se3 import T_FLU_OPTICAL
+from gpvo.io.bag_messages import FrameTree
 from gpvo.io.bag_reader import open_bag
 from gpvo.io.foreign import read_foreign
 from gpvo.live import LiveSettings
 from gpvo.live.engine import Engine
 from gpvo.live.intake import Arrival
 from gpvo.live.job import Live, make_stage, run_live
-from gpvo.live.stages import BaseFrameStage, FrameTree, PoseStage
+from gpvo.live.stages import BaseFrameStage, PoseStage
 from gpvo.live.stereo_stage import StereoStage
 from shim_bags import TOPIC, Kept, engine, flight, flown, messages, save_model, shim_predictor
 

@@ -9,10 +9,9 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
-from gpvo.io.bag_reader import ODOMETRY_TYPE
+from gpvo.io.bag_reader import ODOMETRY_TYPE, TF_STATIC, TF_TYPE
 from gpvo.live.outputs import Wire
 from gpvo.live.ros_wire import ros1_types
-from gpvo.live.stages import TF_STATIC, TF_TYPE
 from ros1_tools import SYSTEM_PYTHON, environment
 from rosbags.typesys import Stores, get_typestore
 from wire_peers import Place, running

@@ -10,13 +10,16 @@ import pytest
 from gpvo.cli import app
 from gpvo.dataset.build import predictions_of
 from gpvo.errors import GpvoError, ModelError
+from gpvo.geometry import se3
+from gpvo.geometry.se3 import T_FLU_OPTICAL
+from gpvo.io.foreign import read_foreign
 from gpvo.io.run import read_run, write_run
 from gpvo.online import modelfile
 from gpvo.online.predictor import Predictor
 from gpvo.publish import PublishSettings
 from gpvo.publish.export import export_model
 from gpvo.publish.job import odometry_of, publish_run
-from gpvo.types import Prediction, Status, VoLog
+from gpvo.types import Mounting, Prediction, Status, VoLog
 from small_model import small_model
 from synthetic_runs import make_run
 from typer.testing import CliRunner
@@ -45,6 +48,21 @@ def test_what_is_stored_is_published_unless_it_is_of_windows(predicted: Path) ->
     plain, of_motions, of_windows = (_covariances(predicted, p) for p in ([], stored, windows))
     assert not np.allclose(of_motions, plain, rtol=0.1)
     np.testing.assert_array_equal(of_windows, plain)
+
+
+def test_messages_name_the_body_that_they_are_of_and_a_run_without_one_is_told(predicted: Path, tmp_path: Path) -> None:
+    run, T_body_cam = read_run(predicted), se3.exp(np.array([0.2, 0.0, 0.1, 0.0, 0.5, 0.0])) @ T_FLU_OPTICAL
+    assert "base_link here is the left camera" in str(publish_run(predicted, replace(GEOMETRY, out=tmp_path / "a.bag")))
+    path = tmp_path / "placed"
+    write_run(path, run.log, predictions=run.predictions, mounting=Mounting(T_body_cam, body="mast"))
+    assert "left camera" not in str(publish_run(path, replace(GEOMETRY, out=tmp_path / "b.bag")))
+    written = read_foreign(tmp_path / "b.bag")
+    assert written.frame_id == "mast"
+    record = list(run.log)[5]
+    motion = T_body_cam @ record.T_prev_cur @ se3.inverse(T_body_cam)
+    T = written.trajectory.T_world_body
+    k = written.t_ns.tolist().index(record.t_ns)
+    np.testing.assert_allclose(se3.inverse(T[k - 1]) @ T[k], motion, atol=1e-9)
 
 
 def test_a_consumer_that_nothing_would_read_is_refused(predicted: Path, tmp_path: Path) -> None:
