@@ -226,8 +226,11 @@ class ErrorStateFilter:
         """Linear update of the error's mean and covariance, Joseph form; :meth:`inject` moves it into the estimate.
 
         ``H`` (B, m, 39), ``residual`` (B, m) at the estimate, ``R`` (b, m, m). ``leave`` (B,): members to leave alone.
-        ``consider``: states that count with their covariance but are not estimated (S. Schmidt, "Application of
-        state-space methods to navigation problems" (1966)).
+        ``consider``: states of unit variance that count with their covariance but are not estimated (S. Schmidt,
+        "Application of state-space methods to navigation problems" (1966)). With an IMU, the others follow what it
+        tells of these. Without one nothing does: the size of VO's bias follows the measured motion, so that noise and
+        changes of speed are in it and in the residual alike, and look like news of the bias. The place, which depends
+        on it by the whole path, would drift with their squares.
         """
         r = residual - (H @ self.dx[:, :, None])[:, :, 0]
         PHt = self.P @ transpose(H)
@@ -252,6 +255,9 @@ class ErrorStateFilter:
         if used.any():
             whitened_H = np.asarray(whitened[:, :, :-1], dtype=np.float64)
             K = np.asarray(np.linalg.solve(transpose(L), whitened_H), dtype=np.float64).transpose(0, 2, 1)
+            if not self._with_imu:
+                # Less what comes by way of the considered states.
+                K -= self.P[:, :, consider] @ K[:, consider]
             K[:, consider] = 0.0
             # A wider R turns S into alpha S, and the gain into a 1/alpha of itself.
             R = R + (alpha - 1.0)[:, None, None] * S

@@ -10,7 +10,7 @@ from gpvo.filters.policies import GeometricPolicy
 from gpvo.filters.propagation import constant_velocity_noise
 from gpvo.filters.run import Flight, fuse_flight
 from gpvo.geometry import se3
-from gpvo.types import Status, VoRecord
+from gpvo.types import MotionError, Prediction, Status, VoRecord
 
 RATE_HZ = 20.0
 SIGMA = np.repeat([2e-4, 1e-4], 3)
@@ -79,3 +79,33 @@ def test_failures_of_vo_are_not_taken_for_motion() -> None:
     found = constant_velocity_noise(records)
     assert found.acceleration == pytest.approx(known.acceleration, rel=0.3)
     assert found.angular_acceleration == pytest.approx(known.angular_acceleration, rel=0.3)
+
+
+class _ScaleDiffersByFlight:
+    """White noise, and a scale that is off by two per cent (1 sigma) of what was measured, the same all flight."""
+
+    name = "scale"
+
+    def noise(self, record: VoRecord, prediction: Prediction | None) -> MotionError:
+        moved = (record.T_prev_cur[:3, :3].T @ record.T_prev_cur[:3, 3])[:, None]
+        root, white = np.concatenate([0.02 * moved, np.zeros((3, 1))]), MotionError.independent(np.diag(SIGMA**2))
+        return replace(white, persistent_root=root, persistent_tau_s=np.array([1e6]), dt_s=record.dt_s).row(None)
+
+
+@pytest.mark.parametrize("off", [-0.02, 0.0, 0.02])
+def test_an_error_that_persists_makes_the_path_no_other_than_that_of_vo(off: float) -> None:
+    """The place followed what changes of speed seem to tell of the scale, and ended 3.4 m short of VO's, whatever the
+    scale was."""
+    rng, t = np.random.default_rng(3), np.arange(round(30.0 * RATE_HZ) + 1) / RATE_HZ
+    forward = 4.0 * t - 2.0 / 0.5 * np.cos(0.5 * t)
+    T = se3.from_rt(np.broadcast_to(np.eye(3), (len(t), 3, 3)), forward[:, None] * np.array([0.0, 0.0, 1.0]))
+    scaled = T.copy()
+    scaled[:, :3, 3] *= 1.0 + off
+    flight = Flight("scale", _records(scaled, rng), T_world_cam=T, truth_valid=np.ones(len(t), bool))
+    place = np.eye(4)
+    for record in flight.records:
+        place = place @ record.T_prev_cur
+    run = fuse_flight(flight, _ScaleDiffersByFlight())
+    assert run.scores.rejected == 0
+    np.testing.assert_allclose(run.T_world_cam[-1, :3, 3] - T[0, :3, 3], place[:3, 3], atol=0.1)
+    assert run.scores.nees_position < 2.0
