@@ -59,13 +59,13 @@ _ANGLES = (
     " them, x, y, z, w, of rotations about fixed axes (degrees=True if they are)"
 )
 _MAX_ROWS = 20_000_000
-_EMPTY = {"", "na", "n/a", "none", "null"}  # how an unknown number is written, beside NaN
+_EMPTY = {"", "na", "n/a", "#n/a", "<na>", "none", "null"}  # how an unknown number is written, beside NaN
 _AXES = {f"{of}{axis}": i + 3 * (of == "r") for of in ("", "p", "t", "r") for i, axis in enumerate("xyz")}
 _AXES |= {"roll": 3, "pitch": 4, "yaw": 5, "r": 3, "p": 4}
 _AXIS = "roll|pitch|yaw|[prt]?[xyz]|r|p"
 _COVARIANCE = re.compile(rf"(?:pose_|position_)?(?:cov|covariance)_({_AXIS})_?({_AXIS})")
 _POSED = re.compile(
-    r"(?:.*_)?(p|t|pos|position|translation|q|quat|quaternion|ori|orientation|rot|rotation)(?:_[rwg][sib](?:_[rwg])?)?_?([xyzw])"
+    r"(?:.*_)?(p|t|pos|pose|position|translation|q|quat|quaternion|ori|orientation|rot|rotation)(?:_[rwg][sib](?:_[rwg])?)?_?([xyzw])"
 )
 _NUMBERED = re.compile(
     r"(?:.*[_.])?(?:(?P<q>q(?:uat|uaternion)?_?\[?[0-3]\]?)|p(?:os|osition)?_?\[?[0-2]\]?)", re.IGNORECASE

@@ -29,6 +29,9 @@ _MANY_STAMPS = 20  # of which some fraction begins with zero
 _DATE = re.compile(r"(\d{4}-\d\d-\d\d)[ T](\d\d:\d\d:\d\d)(\.\d+)?Z?")
 _MAX_BYTES = 2_000_000_000
 _MAX_CHARACTERS = 1_000_000
+# How files that are no text begin, read as if they were.
+_PACKED = {"\x1f\ufffd": "gzip", "(\ufffd/\ufffd": "Zstandard", "\ufffd7zXZ": "xz", "BZh": "bzip2", "PK\x03\x04": "zip"}
+_PACKED |= {"PAR1": "Parquet"}
 UNITS_NS = {"s": 1_000_000_000, "ms": 1_000_000, "us": 1_000, "ns": 1}
 END_OF_ROS_NS = 2**31 * 10**9  # the stamps of ROS count seconds in 31 bits, from 1970 to January 2038
 _UNIT_NAMES = {"s": "seconds", "ms": "milliseconds", "us": "microseconds", "ns": "nanoseconds"}
@@ -53,8 +56,8 @@ def text_lines(path: Path) -> Iterator[tuple[int, str]]:
             raise SourceError("is larger than 2 GB: too large for a log", where=path)
         with open(path, encoding="utf-8-sig", errors="replace", opener=at_once) as file:
             for number, line in enumerate(iter(partial(file.readline, _MAX_CHARACTERS + 1), ""), 1):
-                if "\0" in line:
-                    raise _not_text(number, path)
+                if "\0" in line or (number == 1 and line.startswith(tuple(_PACKED))):
+                    raise _not_text(line, number, path)
                 if len(line) > _MAX_CHARACTERS:
                     raise SourceError(f"line {number} is longer than a million characters", where=path)
                 if text := line.strip().removeprefix("\ufeff"):
@@ -69,9 +72,12 @@ def cure_of_end(path: Path, number: int) -> str | None:
     return "the file breaks off in this line: remove it" if is_last else None
 
 
-def _not_text(number: int, path: Path) -> SourceError:
-    """What to raise where a line holds NUL. Of text in UTF-16 the first line does; file systems fill up with NUL what
-    was not on the disk yet when power was lost."""
+def _not_text(line: str, number: int, path: Path) -> SourceError:
+    """What to raise where a line holds NUL, or the first begins as packed files do. Of text in UTF-16 the first line
+    does; file systems fill up with NUL what was not on the disk yet when power was lost."""
+    packed = next((name for sign, name in _PACKED.items() if number == 1 and line.startswith(sign)), None)
+    if packed is not None:
+        return SourceError(f"is a file of {packed}, no text", where=path, cure="unpack it, or write it as CSV")
     if number == 1:
         return SourceError("is no text file, or one in UTF-16", where=path, cure="give it as UTF-8 text")
     what = f"line {number} holds NUL bytes, as where power was lost while it was written"

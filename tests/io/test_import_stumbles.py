@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import bz2
+import gzip
+import lzma
 import re
 from collections.abc import Callable
 from pathlib import Path
@@ -250,7 +253,7 @@ def test_of_a_twist_they_are_not_the_poses(tmp_path: Path) -> None:
 HEAD = "t,pos x [m],pos y [m],pos z [m],qx,qy,qz,qw"
 
 
-@pytest.mark.parametrize("word", ["", "NA", "None", "null", "N/A", "NaN"])
+@pytest.mark.parametrize("word", ["", "NA", "None", "null", "N/A", "NaN", "#N/A", "<NA>"])
 def test_what_stands_for_no_number_costs_its_row_alone(word: str, tmp_path: Path) -> None:
     path = tmp_path / "log.csv"
     path.write_text(f"{HEAD}\n0.0,{POSE}\n0.1,0,{word},0,0,0,0,1\n0.2,{POSE}\n")
@@ -363,6 +366,15 @@ def test_quaternions_by_their_usual_names(name: str, tmp_path: Path) -> None:
     np.testing.assert_array_equal(T[2], [[1, 0, 0, 1], [0, 1, 0, 2], [0, 0, 1, 3], [0, 0, 0, 1]])
 
 
+@pytest.mark.parametrize("name", ["Pose.{}", "pose_{}", "pose/position/{}"])
+def test_positions_by_their_usual_names(name: str, tmp_path: Path) -> None:
+    path, names = tmp_path / "log.csv", ",".join(name.format(a) for a in "xyz")
+    path.write_text(
+        "\n".join([f"t,{names},Quat.x,Quat.y,Quat.z,Quat.w", *(f"{k * 0.1:.1f},1,2,3,0,0,0,1" for k in range(5))])
+    )
+    np.testing.assert_array_equal(read_foreign(path).trajectory.T_world_body[:, :3, 3], [[1, 2, 3]] * 5)
+
+
 @pytest.mark.parametrize(
     ("given", "named"),
     [
@@ -379,3 +391,22 @@ def test_what_a_format_does_not_read_is_refused(given: dict[str, Any], named: st
     with pytest.raises(SourceError, match=rf"{named} has no effect on this file .tum."):
         read_foreign(path, **given)
     assert len(read_foreign(path, covariance_of="pose").t_ns) == 5
+
+
+@pytest.mark.parametrize(
+    ("packed", "name"),
+    [
+        (gzip.compress(b"t,x,y,z,qx,qy,qz,qw\n"), "gzip"),
+        (lzma.compress(b"t,x,y,z,qx,qy,qz,qw\n"), "xz"),
+        (bz2.compress(b"t,x,y,z,qx,qy,qz,qw\n"), "bzip2"),
+        (bytes.fromhex("28b52ffd24036100"), "Zstandard"),
+        (b"PK\x03\x04\x14\x00", "zip"),
+        (b"PAR1\x15\x04", "Parquet"),
+    ],
+)
+def test_a_packed_file_is_named_as_such(packed: bytes, name: str, tmp_path: Path) -> None:
+    """One of gzip without NUL in its first line was said to lack columns, and its bytes were shown."""
+    path = tmp_path / "log.csv"
+    path.write_bytes(packed)
+    with pytest.raises(SourceError, match=f"is a file of {name}, no text .unpack it"):
+        read_foreign(path)
