@@ -243,7 +243,7 @@ def _white_noise(errors: Array, stated: Array, count: int) -> Array:
     windows, rank = np.lib.stride_tricks.sliding_window_view(around, count, axis=0), 3 * count // 4
     blocks = (windows[k : k + 1000] for k in range(0, len(windows), 1000))  # all at once would fill the memory
     # Not their median: where noise steps up, half of them are still small.
-    quartile = np.concatenate([np.partition(block, rank)[..., rank] for block in blocks])
+    quartile = np.concatenate([np.partition(block, rank)[..., rank].copy() for block in blocks])
     return np.asarray(quartile / (1.1503 * np.sqrt(2)) * stated[:, None])
 
 

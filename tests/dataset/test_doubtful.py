@@ -408,3 +408,14 @@ def test_markers_that_are_confused_between_frames_are_seen_at_the_rate_of_the_tr
     np.testing.assert_array_equal(in_waits(log, [s.t_ns for s in found]), wrong)
     run = Run(Path("mocap"), "mocap", log, turned, None, Mounting(), [])
     assert np.rad2deg(evaluate_run(run).trajectory.rpe_frame.rotation_rad.max) < 5.0
+
+
+def test_the_noise_around_each_motion_fills_no_memory():
+    """Each block's quartiles were views that kept its windows: 8 kB a motion, so that a million took 8 GB."""
+    errors = np.random.default_rng(0).standard_normal((20_000, 6))
+    tracemalloc.start()
+    sigma = doubtful._white_noise(errors, np.ones(len(errors)), 166)
+    peak = tracemalloc.get_traced_memory()[1]
+    tracemalloc.stop()
+    assert peak < 50e6
+    assert np.abs(sigma - 1.0).mean() < 0.1
