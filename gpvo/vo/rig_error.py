@@ -66,7 +66,7 @@ _NEGLIGIBLE = 1e-12  # probability of a kind
 _STEP, _STEPS = 5, 20  # motions from one look for a move of the cameras to the next; of those looked back over
 _LIKELY_RAD, _KNOCK_RAD = 1.7e-3, 0.05  # by which a knock turns a camera about each axis, usually and at most
 _JOLT = 0.01  # and by which it moves a lens, in units of the prior
-_MOVED = 50.0  # log odds of two rigs over one from which the cameras have moved: on six real drives at most 20
+_MOVED = 50.0  # log odds of two rigs over one from which the cameras have moved: on real drives at most 26
 _UNDISPLACED = 0.9  # share of the points that lie alike, in rows that are allowed
 _NEAR = 6.0  # disparity of the points used, in standard deviations of noise: that of far ones says nothing for sure
 
