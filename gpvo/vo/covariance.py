@@ -212,11 +212,13 @@ class DesignEffect:
         column, row = np.clip((share * _PARTS).astype(np.int64), 0, np.array(_PARTS) - 1).T
         part = row * _PARTS[0] + column == np.arange(_PARTS[0] * _PARTS[1])[:, None]
         information = np.stack([np.einsum("ikn,iln->kl", B, B) for B in (A[..., p] for p in part)])
-        covariance = np.linalg.inv(information.sum(axis=0))
-        told = information @ covariance  # by each part; the motion takes the square of it off
+        total = information.sum(axis=0)
+        told = information @ np.linalg.inv(total)  # by each part; the motion takes the square of it off
         expected = float(np.trace(told, axis1=1, axis2=2).sum() - (told * told.transpose(0, 2, 1)).sum())
         variance = max(float((z**2).sum()) / max(z.size - 6.0, 1.0), 1e-12)
-        scores = part @ np.einsum("ikn,in->nk", A, z) @ np.linalg.cholesky(covariance) / variance**0.5
+        # Rotation first, which is known best: sums over motions need axes that stay.
+        root, scores = np.linalg.cholesky(total[::-1, ::-1]), part @ np.einsum("ikn,in->nk", A[:, ::-1], z)
+        scores = np.linalg.solve(root, scores.T).T / variance**0.5
         if t_ref_ns != self._t_ref_ns:  # of motions since one frame, only the last adds to what follows
             self._before, self._t_ref_ns = self._lately, t_ref_ns
         sums, squares = self._before
