@@ -96,14 +96,17 @@ class BagSource(ImageSource):
             asked = (left_topic, right_topic, imu_topic, truth_topic)
             self._topics = _choose_topics(reader, path, chain, asked, any_truth=truth_frame is not None)
             sizes, first = _first_images(reader, path, self._topics)
+            is_placed = TF_STATIC in topics_of(reader, (TF_TYPE,))
             rig = read_stereo_yaml(chain, size=sizes[0]) if chain else _rig_from_bag(reader, path, self._topics)
             for size, lens, topic in zip(sizes, (rig.left, rig.right), (self._topics.left, self._topics.right)):
                 check_size(f"images on '{topic}' are", size, lens, path)
         super().__init__(path, path.stem if path.is_file() else path.resolve().name, rig, **options)
         self.span_ns = span = _span(first, self._topics.count)
         self._tolerance_ns = tolerance_ns(tolerance_s)
-        if base_frame is not None or self.mounting.T_body_cam is None:
-            self._place(base_frame)
+        if base_frame is not None:
+            self._place(frame_name(base_frame))
+        elif is_placed and self.mounting.T_body_cam is None:
+            self._say_where_placed()
         self.imu = read_imu(path, self._topics.imu, rig.timeshift_cam_imu_s, self.remark)
         if self.imu is not None and (self.imu.t_ns[0] > span[1] or self.imu.t_ns[-1] < span[0]):
             self.remark("the IMU does not overlap the images in time, so it says nothing of them: two clocks?")
@@ -136,23 +139,31 @@ class BagSource(ImageSource):
             for t_ns, left, right in pair_streams(stream, topics.left, self._tolerance_ns, report, self.path):
                 yield t_ns, decode_message(left, self.depth), decode_message(right, self.depth)
 
-    def _place(self, base: str | None) -> None:
-        """Take ``base`` for the body; without one, say so where the bag places its camera on a base_link."""
+    def _place(self, base: str) -> None:
+        """Take ``base`` for the body."""
         with open_bag(self.path) as reader:
-            _, image = next(messages(reader, [self._topics.left], lambda _: None))
-            camera = frame_name(image.header.frame_id)
-            if base is None:
-                if _place_of(reader, _BASE, camera, (TF_STATIC,), self.path) is not None:
-                    what = f"{TF_STATIC} says where the camera sits on '{_BASE}', which is not used"
-                    self.remark(f"{what}: with --base-frame {_BASE} it is what 'gpvo publish' speaks of")
-                return
-            T_base_camera = _place_of(reader, frame_name(base), camera, TF_TOPICS, self.path)
+            camera = _camera_frame(reader, self._topics.left)
+            if base == camera:
+                told = f"'{printable(base)}' is the frame of the left images: its axes are the camera's, not a robot's"
+                raise SourceError(told, where=self.path, cure=f"name another frame, such as {_BASE}")
+            T_base_camera = _place_of(reader, base, camera, TF_TOPICS, self.path)
         if T_base_camera is None:
             told = f"no transform on {' or '.join(TF_TOPICS)} joins '{printable(base)}' to '{printable(camera)}'"
             cure = "name a frame that they join to it, or leave out --base-frame"
             raise SourceError(f"{told}, the frame of the left images", where=self.path, cure=cure)
-        place = T_base_camera @ self.rectifier.T_left_cam
-        self.mounting = replace(self.mounting, T_body_cam=place, body=frame_name(base))
+        self.mounting = replace(self.mounting, T_body_cam=T_base_camera @ self.rectifier.T_left_cam, body=base)
+
+    def _say_where_placed(self) -> None:
+        """That the bag places its camera on a base_link, which is not used; what it says may as well be of no use."""
+        try:
+            with open_bag(self.path) as reader:
+                camera = _camera_frame(reader, self._topics.left)
+                if camera == _BASE or _place_of(reader, _BASE, camera, (TF_STATIC,), self.path) is None:
+                    return
+        except SourceError:
+            return
+        what = f"{TF_STATIC} says where the camera sits on '{_BASE}', which is not used"
+        self.remark(f"{what}: with --base-frame {_BASE} it is what 'gpvo publish' speaks of")
 
     def _read_truth(self, topic: str, frame: str | None) -> TruthLog:
         try:
@@ -172,14 +183,19 @@ class BagSource(ImageSource):
         return truth
 
 
+def _camera_frame(reader: Any, left_topic: str) -> str:
+    _, image = next(messages(reader, [left_topic], lambda _: None))
+    return frame_name(image.header.frame_id)
+
+
 def _place_of(reader: Any, base: str, camera: str, topics: tuple[str, ...], path: Path) -> Array | None:
     """T_base_camera (4, 4) by the transforms in a bag, None where they do not join the two.
 
     Raises SourceError where it changes: a mounting is rigid.
     """
-    tree, place = FrameTree(), np.eye(4) if base == camera else None
+    tree, place = FrameTree(), None
     if known := [t for t in topics if t in topics_of(reader, (TF_TYPE,))]:
-        for _, message in messages(reader, known):
+        for _, message in messages(reader, known, lambda _: None):
             tree.take(message)
             now = tree.transform(base, camera)
             if place is not None and now is not None and has_moved(place, now):

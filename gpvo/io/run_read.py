@@ -295,8 +295,10 @@ def _read_rig(path: Path) -> tuple[StereoCamera | None, Mounting]:
         with _guarded(path):
             raw = document.get("camera")
             camera = None if raw is None else StereoCamera(**{k: raw[k] for k in field_names(StereoCamera)})
-            body = printable(document.get("body", "base_link"))
-            return camera, Mounting(pose("T_body_cam"), pose("T_imu_cam"), body)
+            body = document.get("body", "base_link")
+            if not (isinstance(body, str) and 0 < len(body) <= 256):
+                raise ValueError("body is not the name of a frame")
+            return camera, Mounting(pose("T_body_cam"), pose("T_imu_cam"), printable(body))
     except CalibrationError as problem:
         raise SourceError(problem.what, where=path) from None
 

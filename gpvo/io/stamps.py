@@ -30,8 +30,8 @@ _DATE = re.compile(r"(\d{4}-\d\d-\d\d)[ T](\d\d:\d\d:\d\d)(\.\d+)?Z?")
 _MAX_BYTES = 2_000_000_000
 _MAX_CHARACTERS = 1_000_000
 # How files that are no text begin, read as if they were.
-_PACKED = {"\x1f\ufffd": "gzip", "(\ufffd/\ufffd": "Zstandard", "\ufffd7zXZ": "xz", "BZh": "bzip2", "PK\x03\x04": "zip"}
-_PACKED |= {"PAR1": "Parquet"}
+_PACKED = {"\x1f\ufffd": "gzip", "(\ufffd/\ufffd": "Zstandard", "\ufffd7zXZ": "xz", "PK\x03\x04": "zip"}
+_PACKED |= {"BZh91AY&SY": "bzip2", "PAR1\x15": "Parquet"}
 UNITS_NS = {"s": 1_000_000_000, "ms": 1_000_000, "us": 1_000, "ns": 1}
 END_OF_ROS_NS = 2**31 * 10**9  # the stamps of ROS count seconds in 31 bits, from 1970 to January 2038
 _UNIT_NAMES = {"s": "seconds", "ms": "milliseconds", "us": "microseconds", "ns": "nanoseconds"}

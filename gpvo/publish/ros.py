@@ -183,7 +183,8 @@ def robot_localization_yaml(
     row = "false, false, false"
     use = "true,  true,  true "
     head = f"""# robot_localization fed by gpvo: body twist with its full covariance.
-# gpvo publishes {topic} in odom -> {base} and broadcasts no transform; this node does.
+# gpvo publishes {topic} in odom -> {base} and broadcasts no transform; this node does, to base_link:
+# if that is another frame, it needs the transform between the two.
 """
     parameters = f"""frequency: {rate_hz:.1f}
 sensor_timeout: 0.2

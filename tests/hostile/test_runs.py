@@ -93,6 +93,13 @@ def test_a_covariance_that_is_none_is_refused(column: str, value: float, run: Pa
         read_run(run)
 
 
+@pytest.mark.parametrize("body", [None, "", 7, {}, "x" * 300])
+def test_a_body_that_is_no_name_is_refused(body: object, run: Path) -> None:
+    write_json(run / "rig.json", {**read_json(run / "rig.json"), "body": body})
+    with pytest.raises(SourceError, match=r"rig\.json: .*body is not the name of a frame"):
+        read_run(run)
+
+
 def test_a_mounting_beyond_all_measure_is_refused_without_a_warning(run: Path) -> None:
     rig = read_json(run / "rig.json")
     write_json(run / "rig.json", {**rig, "T_body_cam": np.diag([1e300, 1.0, 1.0, 1.0])})

@@ -83,6 +83,18 @@ def test_a_body_that_the_camera_turns_on_is_refused(tmp_path):
         open_source(path, base_frame="base_link")
 
 
+def test_transforms_that_nobody_asked_for_refuse_no_bag(tmp_path):
+    path = _placed(tmp_path, ("/tf_static", TILTED), ("/tf_static", TILTED @ TILTED))
+    assert "--base-frame" not in " ".join(open_source(path).report.notes)
+    with pytest.raises(SourceError, match="changes"):
+        open_source(path, base_frame="base_link")
+
+
+def test_the_frame_of_the_images_is_no_body(tmp_path):
+    with pytest.raises(SourceError, match="'cam' is the frame of the left images"):
+        open_source(_placed(tmp_path, ("/tf_static", TILTED)), base_frame="cam")
+
+
 def test_single_storage_files(tmp_path):
     folder = _write(tmp_path, "mcap")
     assert len(seq.frames_of(open_source(next(folder.glob("*.mcap"))))) == 12
