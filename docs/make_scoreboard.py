@@ -14,7 +14,7 @@ import tempfile
 from pathlib import Path
 
 from baselines import baselines
-from gpvo.dataset.build import build_run, leave_one_out
+from gpvo.dataset.build import build_run, leave_out
 from gpvo.dataset.errors import motion_errors
 from gpvo.evaluation.evaluate import evaluate_run
 from gpvo.evaluation.score import score_folder, write_board, write_statements
@@ -36,7 +36,7 @@ def fly(folder: Path) -> list[Run]:
 
 def state(folder: Path) -> None:
     """Files of what every method states of every flight."""
-    for run, others in leave_one_out(fly(folder / "runs")):
+    for (run,), others in leave_out(fly(folder / "runs")):
         training = [build_run(other) for other in others]
         save_model(train_sets(training, TrainConfig(), judge=False), folder / "model.gpvo")
         predictor = Predictor.load(folder / "model.gpvo")

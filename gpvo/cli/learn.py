@@ -67,7 +67,7 @@ def train(
     scheduler: Annotated[str | None, "Address of a Dask scheduler."] = None,
     json_: Json = False,
 ) -> None:
-    """Train an error model; score it by leaving each run out.
+    """Train an error model; score it by leaving each run out, or a 24th of more than 24 runs.
 
     Interrupted training resumes from its finished folds when started again.
 
@@ -229,7 +229,10 @@ def _print_table(document: dict[str, Any]) -> None:
         "run" if document.get("folds_are") != "time blocks" else "part of one run (this says nothing about other runs)"
     )
     say(f"NEES per degree of freedom on each {what} left out (1 is right), then means")
-    say(", ".join(f"{k + 1}: {f['held_out']} ({f['rows']} rows)" for k, f in enumerate(document["folds"])))
+    if few:
+        say(", ".join(f"{k + 1}: {f['held_out']} ({f['rows']} rows)" for k, f in enumerate(document["folds"])))
+    else:
+        say(f"{len(document['folds'])} runs; the document (--json) has a line for each")
     show(("method", *columns, "mean", "median", "1 sig", "NLL", "stated"), rows)
     say("1 sig: share within 1 sigma (0.68 is right). NLL: nats per axis, as a Gaussian, lower is better;")
     say("stated: under the stated density, where it has heavier tails. _vt: for the translation alone.")

@@ -299,10 +299,14 @@ def predictions_of(run: Run, predictor: Predictor | None) -> Mapping[int, Predic
     return run.predictions_of_motions if predictor is None else predictor.require_motions().replay(run.log)
 
 
-def leave_one_out(items: Sequence[T]) -> Iterator[tuple[T, list[T]]]:
-    """Each item held out once, with all the others."""
-    for k, item in enumerate(items):
-        yield item, [other for i, other in enumerate(items) if i != k]
+def leave_out(items: Sequence[T], folds: int | None = None) -> Iterator[tuple[list[T], list[T]]]:
+    """Items held out together, with all the others: each once, and alone, or in ``folds`` parts where they are more.
+
+    Part k holds every ``folds``-th item from the k-th on.
+    """
+    n = min(len(items), folds or len(items))
+    for k in range(n):
+        yield list(items[k::n]), [other for i, other in enumerate(items) if i % n != k]
 
 
 def group_labels(lengths: Sequence[int]) -> tuple[NDArray[np.int64], str]:

@@ -10,7 +10,7 @@ from typing import Any
 
 import numpy as np
 
-from gpvo.dataset.build import build_run, leave_one_out
+from gpvo.dataset.build import build_run, leave_out
 from gpvo.dataset.errors import motion_errors
 from gpvo.errors import SourceError
 from gpvo.evaluation.document import run_document
@@ -64,7 +64,7 @@ def by_twins(
         own = evaluate_run(run, predictor, options, [statement(run, twins)], misfits)
         return run_document(own), [own]
     options = replace(options, truth_sigma=options.truth_sigma or (0.0, 0.0))  # simulated truth is exact
-    found = [evaluate_run(t, predictor, options, [statement(t, others)], ()) for t, others in leave_one_out(twins)]
+    found = [evaluate_run(t, predictor, options, [statement(t, others)], ()) for (t,), others in leave_out(twins)]
     mean = average([run_document(e) for e in found])
     # A verdict is in words, which have no mean: the numbers speak.
     about = {"run": run.name, "source": run.meta.get("source"), "verdict": None}

@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from gpvo.dataset.build import leave_one_out
+from gpvo.dataset.build import leave_out
 from gpvo.dataset.doubtful import false_motions, in_waits
 from gpvo.errors import SourceError
 from gpvo.evaluation.evaluate import EvaluateOptions, Evaluation, distinct, evaluate_run
@@ -216,15 +216,16 @@ def write_left_out(trained: TrainedModel, runs: Sequence[Run], config: TrainConf
 
     ``trained`` from the same ``runs``, in their order, with its folds kept in ``config.keep``.
     """
-    from gpvo.learning.train import fold_model  # loads torch, which judging does without
+    from gpvo.learning.train import MOST_FOLDS, fold_model  # loads torch, which judging does without
 
     assert config.keep is not None
     names = distinct([run.name for run in runs])
     options = EvaluateOptions(align=config.align, time_offset_s=config.time_offset_s)
-    folds = leave_one_out(trained.sets)
-    for run, name, (held_out, others) in zip(runs, names, folds, strict=True):
+    named = leave_out(list(zip(names, runs, strict=True)), MOST_FOLDS)
+    for (held_out, others), (left_out, _) in zip(leave_out(trained.sets, MOST_FOLDS), named, strict=True):
         predictor = Predictor.load(fold_model(held_out, others, config, config.keep))
-        write_statements(evaluate_run(run, predictor, options), folder, name, waits=config.waits)
+        for name, run in left_out:
+            write_statements(evaluate_run(run, predictor, options), folder, name, waits=config.waits)
 
 
 def write_statements(evaluation: Evaluation, folder: Path, name: str, waits: str = "drop") -> list[Path]:

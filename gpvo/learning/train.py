@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from gpvo import __version__
-from gpvo.dataset.build import MIN_ROWS, MIN_SEQUENCES, TrainingSet, leave_one_out
+from gpvo.dataset.build import MIN_ROWS, MIN_SEQUENCES, TrainingSet, leave_out
 from gpvo.errors import GpvoError, ModelError
 from gpvo.files import read_json, write_json
 from gpvo.geometry.covariance import variances
@@ -39,6 +39,8 @@ from gpvo.types import Array, Prediction
 
 OnFit = Callable[[int, int], None]
 """Told how many fits of a training are done, of how many."""
+MOST_FOLDS = 24
+"""More runs than this are left out in so many parts: a fit for each of hundreds would take days."""
 JUDGED_BLOCKS = 3
 """Parts of a single sequence that are left out in turn."""
 SLIP_MEDIANS, SLIP_SIGMAS = 20.0, 5.0
@@ -114,13 +116,15 @@ def train_table(
 ) -> dict[str, Any]:
     """``folds`` (a sequence left out, all methods), ``mean`` over them, and ``comparison`` with the best scaled row.
 
-    For a single sequence, blocks of time are left out: they say less, and have no intervals; see ``folds_are``.
+    Each sequence is judged by what did not learn from it: from all others, or from those in other parts where there are
+    more than :data:`MOST_FOLDS`. For a single sequence, blocks of time are left out: they say less, and have no
+    intervals; see ``folds_are``.
     """
     parts = sets if len(sets) > 1 else time_blocks(sets[0])
-    jobs = [(held_out, train_on, config) for held_out, train_on in leave_one_out(parts) if train_on]
+    jobs = [(held_out, train_on, config) for held_out, train_on in leave_out(parts, MOST_FOLDS) if train_on]
     done, total = count(1), len(jobs) + 1  # the model itself comes last
     on_fit(0, total)
-    folds = map_jobs(
+    judged = map_jobs(
         _kept_fold,
         jobs,
         jobs=config.jobs,
@@ -128,8 +132,9 @@ def train_table(
         scheduler=config.scheduler,
         on_done=lambda: on_fit(next(done), total),
     )
-    if not folds:
+    if not judged:
         return {"folds": [], "folds_are": None, "mean": {m: empty() for m in METHODS}, "comparison": None}
+    folds = [judged[k % len(jobs)][k // len(jobs)] for k in range(len(parts))]
     mean = {m: average([f["methods"][m] for f in folds]) for m in METHODS}
     comparison = _compare(folds, mean)
     if len(sets) == 1:  # blocks of one flight are no sample of flights
@@ -153,38 +158,51 @@ def time_blocks(s: TrainingSet) -> list[TrainingSet]:
     return [replace(bare.rows(r), name=f"{s.name}, part {k + 1}") for k, r in enumerate(rows)]
 
 
-def _kept_fold(held_out: TrainingSet, train_on: Sequence[TrainingSet], config: TrainConfig) -> dict[str, Any]:
+def _kept_fold(
+    held_out: Sequence[TrainingSet], train_on: Sequence[TrainingSet], config: TrainConfig
+) -> list[dict[str, Any]]:
     """A fold, from ``config.keep`` if an interrupted training has left it there."""
     if config.keep is None:
         return _fold(held_out, train_on, config)
     model = fold_model(held_out, train_on, config, config.keep)
     path = model.with_suffix(".json")
     if not path.is_file():
-        write_json(path, _fold(held_out, train_on, config, model))
-    return read_json(path)
+        write_json(path, {"folds": _fold(held_out, train_on, config, model)})
+    return list(read_json(path)["folds"])
 
 
-def fold_model(held_out: TrainingSet, train_on: Sequence[TrainingSet], config: TrainConfig, keep: str) -> Path:
-    """Where a training in progress keeps the model that has not learned from one sequence; its scores lie beside it."""
-    sha = hashlib.sha256(repr((code_digest(), versions(), config.settings())).encode())
-    for s in (held_out, *train_on):
+def fold_model(
+    held_out: Sequence[TrainingSet], train_on: Sequence[TrainingSet], config: TrainConfig, keep: str
+) -> Path:
+    """Where a training in progress keeps the model that has not learned from some sequences; its scores lie beside
+    it."""
+    sha = hashlib.sha256(repr((code_digest(), versions(), config.settings(), len(held_out))).encode())
+    for s in (*held_out, *train_on):
         sha.update(repr((s.digest(), s.counts, s.camera)).encode() + s.lost_xi.tobytes() + s.lost_jump.tobytes())
     return Path(keep) / f"{sha.hexdigest()}.gpvo"
 
 
 @fixed_threads(1)
 def _fold(
-    held_out: TrainingSet, train_on: Sequence[TrainingSet], config: TrainConfig, model: Path | None = None
-) -> dict[str, Any]:
-    """All methods fitted without one sequence and scored on it; the fitted ones go into the file ``model``."""
+    held_out: Sequence[TrainingSet], train_on: Sequence[TrainingSet], config: TrainConfig, model: Path | None = None
+) -> list[dict[str, Any]]:
+    """All methods fitted without some sequences and scored on each of these; the fitted ones go into the file
+    ``model``."""
     arrays, thesis = method_arrays(train_on), fit_thesis(train_on, seed=config.seed)
-    simple = simple_covariances(arrays, held_out.covariances, held_out.v_t, len(held_out))
-    stated: dict[str, tuple[Any, ...]] = {name: (np.zeros_like(held_out.Y), C) for name, C in simple.items()}
-    stated["gp_thesis"] = thesis.predict(held_out.select(thesis.columns))
     learned = fit_model(train_on, config)
     if model is not None:
         fitted = {**learned.arrays, **arrays, **thesis.to_arrays()}
         modelfile.save(model, fitted, _header(train_on, config, learned, {}))
+    return [_judged(s, arrays, thesis, learned) for s in held_out]
+
+
+def _judged(
+    held_out: TrainingSet, arrays: Mapping[str, Array], thesis: ThesisModel, learned: Learned
+) -> dict[str, Any]:
+    """A line of the table: what each method states of a sequence that none of them has learned from, and its scores."""
+    simple = simple_covariances(arrays, held_out.covariances, held_out.v_t, len(held_out))
+    stated: dict[str, tuple[Any, ...]] = {name: (np.zeros_like(held_out.Y), C) for name, C in simple.items()}
+    stated["gp_thesis"] = thesis.predict(held_out.select(thesis.columns))
     estimate, of_base = (estimate_set(model, held_out) for model in (learned.model, learned.base))
     stated["learned"] = (estimate.mean, estimate.covariance, estimate.nu)
     stated["base"] = (of_base.mean, of_base.covariance, of_base.nu)
@@ -317,14 +335,14 @@ def train_position(sets: Sequence[TrainingSet], config: TrainConfig, *, judge: b
     """The thesis' model of positions: a GP of the residuals (n, 3) [m] on velocity and feature count, isotropic;
     ``features="auto"`` means these."""
     model = _fit_position(sets, config)
+    fitted: dict[str, ThesisModel] = {}
+    for held_out, others in leave_out(sets, MOST_FOLDS) if judge and len(sets) > 1 else ():
+        fitted |= dict.fromkeys((s.name for s in held_out), _fit_position(others, config))
     folds: list[dict[str, Any]] = []
-    for held_out, others in leave_one_out(list(sets)) if judge and len(sets) > 1 else ():
-        fitted = _fit_position(others, config)
-        stated = fitted.predict(held_out.select(fitted.columns))
-        methods: dict[str, Any] = {m: empty() for m in METHODS} | {"gp_thesis": score(held_out.Y, *stated)}
-        folds.append(
-            {"held_out": held_out.name, "rows": len(held_out), "lost": held_out.counts["lost"], "methods": methods}
-        )
+    for s in sets if fitted else ():
+        stated = fitted[s.name].predict(s.select(fitted[s.name].columns))
+        methods: dict[str, Any] = {m: empty() for m in METHODS} | {"gp_thesis": score(s.Y, *stated)}
+        folds.append({"held_out": s.name, "rows": len(s), "lost": s.counts["lost"], "methods": methods})
     X = np.concatenate([s.select(model.columns) for s in sets])
     X = X[np.isfinite(X).all(axis=1)]
     header = {

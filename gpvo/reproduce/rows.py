@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from gpvo import __version__, runner
-from gpvo.dataset.build import leave_one_out
+from gpvo.dataset.build import leave_out
 from gpvo.errors import GpvoError, OutputError
 from gpvo.files import digest_of_file
 from gpvo.io import open_source
@@ -156,7 +156,7 @@ def _each_by_the_others(e: Experiment, name: str, runs_of: Callable[[str], tuple
     """All ways over all sequences; rows of one ``name`` share what they have in common."""
     for way in WAYS:
         runs = runs_of(method_of(e, way).preset)
-        jobs = [job_of(name, e, way, (run,), tuple(others), name) for run, others in leave_one_out(runs)]
+        jobs = [job_of(name, e, way, (run,), tuple(others), name) for (run,), others in leave_out(runs)]
         yield Cell(e, way, "real", tuple(job for job in jobs if job is not None))
 
 

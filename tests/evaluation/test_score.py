@@ -218,9 +218,14 @@ def test_a_method_that_leaves_a_sequence_out_is_refused(written, tmp_path: Path)
         score_folder(tmp_path / "all" / "triangulation")
 
 
-def test_the_table_of_a_training_is_scored_again_from_files_alone(tmp_path: Path, capsys) -> None:
-    """Each run left out in turn: what was stated of it goes into files, which hold all that the table shows."""
-    runs = [tmp_path / f"run{k}" for k in range(2)]
+@pytest.mark.parametrize(("count", "parts"), [(2, 24), (3, 2)])
+def test_the_table_of_a_training_is_scored_again_from_files_alone(
+    tmp_path: Path, capsys, monkeypatch: pytest.MonkeyPatch, count: int, parts: int
+) -> None:
+    """Each run left out, in turn or in parts: what was stated of it goes into files, which hold all that the table
+    shows."""
+    monkeypatch.setattr("gpvo.learning.train.MOST_FOLDS", parts)
+    runs = [tmp_path / f"run{k}" for k in range(count)]
     for seed, path in enumerate(runs):
         log, truth = synthetic_run(seed, n=80)
         write_run(path, log, truth=truth)

@@ -41,6 +41,7 @@ from gpvo.learning.store import (
     update,
 )
 from gpvo.learning.train import TrainedModel, _slips, train_sets, unseen_axes
+from gpvo.online import modelfile
 from gpvo.online.base import COASTED, TWIST_COLUMNS
 from gpvo.online.division import divide
 from gpvo.online.features import AXES
@@ -234,6 +235,25 @@ def test_linear_algebra_runs_on_one_thread_so_that_bytes_do_not_depend_on_the_ma
         train_sets(training_sets(range(3), n=120), QUICK, judge=False)
     assert seen
     assert set(seen) == {1}
+
+
+def test_many_runs_are_left_out_in_parts(monkeypatch, tmp_path):
+    """Every run is judged, in its place, and by a model that has learned from the other parts alone."""
+    monkeypatch.setattr(training, "MOST_FOLDS", 2)
+    sets, fits = training_sets(range(5), n=120), []
+    config = replace(QUICK, keep=str(tmp_path))
+    trained = train_sets(sets, config, on_fit=lambda done, total: fits.append((done, total)))
+    folds = trained.table["folds"]
+    assert [f["held_out"] for f in folds] == [s.name for s in sets]
+    assert fits[-1][1] == 3
+    for part, others in ((sets[::2], sets[1::2]), (sets[1::2], sets[::2])):
+        file = training.fold_model(part, others, config, str(tmp_path))
+        assert [s["name"] for s in modelfile.load(file)[1]["sequences"]] == [s.name for s in others]
+        stated = Predictor.load(file)
+        for s in part:
+            C = _said(stated, s).covariance
+            of_table = next(f for f in folds if f["held_out"] == s.name)["methods"]["learned"]
+            assert of_table["nees_dof"]["joint"] == pytest.approx(nees(s.Y, C).mean() / 6, rel=1e-6)
 
 
 def test_rows_of_another_target_are_refused():
