@@ -67,9 +67,9 @@ def train(
     scheduler: Annotated[str | None, "Address of a Dask scheduler."] = None,
     json_: Json = False,
 ) -> None:
-    """Train an error model; score it by leaving each run out, or a 24th of more than 24 runs.
+    """Train an error model; score it by leaving each run out.
 
-    Interrupted training resumes from its finished folds when started again.
+    Of more than 24 runs, a 24th is left out at a time. Interrupted training resumes from its finished folds when started again.
 
     Example: gpvo train runs/a runs/b runs/c -o errors.gpvo
     """
