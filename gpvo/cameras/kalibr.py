@@ -168,11 +168,12 @@ def make_lens(
     width, height = resolution_px
     name = distortion_model.lower().replace("_", "-")
     if name in ("radtan", "radial-tangential", "plumb-bob", "rational-polynomial", "none", ""):
-        # The rational model with zeros beyond the fifth coefficient is the common one.
-        if any(distortion[5:]):
-            cure = "calibrate with five (radtan), or rectify the images"
-            raise CalibrationError("more than five distortion coefficients are not supported", where=where, cure=cure)
-        return PinholeRadtan(fx, fy, cx, cy, width, height, (*distortion, *[0.0] * 5)[:5])
+        if any(distortion[8:]):
+            cure = "calibrate with eight (rational) or five (radtan), or rectify the images"
+            text = "coefficients of a thin prism or a tilted sensor, the ninth and on, are not supported"
+            raise CalibrationError(text, where=where, cure=cure)
+        count = 8 if any(distortion[5:]) else 5  # the rational model with zeros beyond the fifth is the common one
+        return PinholeRadtan(fx, fy, cx, cy, width, height, (*distortion, *[0.0] * 8)[:count])
     if name in ("equidistant", "fisheye", "kannala-brandt", "kannala-brandt4"):
         if len(distortion) < 4 or any(distortion[4:]):
             raise CalibrationError(f"a fisheye needs 4 distortion coefficients, not {len(distortion)}", where=where)
@@ -192,7 +193,7 @@ def _lens(block: dict[str, Any], where: str) -> CameraModel:
     # As EuRoC spells it, or as Kalibr does.
     key = "distortion_coefficients" if "distortion_coefficients" in block else "distortion_coeffs"
     if distortion_model != "none":
-        distortion = get_numbers(block, key, (4, 5), where)
+        distortion = get_numbers(block, key, (4, 5, 8), where)
     elif key in block and "distortion_model" not in block:
         cure = "add 'distortion_model: radtan' or 'equidistant'"
         raise CalibrationError(f"holds '{key}' of no distortion_model", where=where, cure=cure)

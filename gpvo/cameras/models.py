@@ -1,4 +1,4 @@
-"""Lens models: pinhole with radial-tangential distortion, and Kannala-Brandt fisheye. NumPy only.
+"""Lens models: pinhole with radial-tangential distortion, also rational, and Kannala-Brandt fisheye. NumPy only.
 
 Pixel (0, 0) is the centre of the first pixel, as in OpenCV and Kalibr. Rays and points are in the camera's optical
 frame (x right, y down, z forward).
@@ -11,7 +11,7 @@ from dataclasses import dataclass
 from typing import ClassVar
 
 import numpy as np
-from numpy.polynomial.polynomial import polyval
+from numpy.polynomial.polynomial import polyadd, polyder, polymul, polysub, polyval
 from numpy.typing import NDArray
 
 from gpvo.types import Array
@@ -38,6 +38,12 @@ class CameraModel(ABC):
         """fx, fy, cx, cy."""
         return [float(v) for v in (self.fx_px, self.fy_px, self.cx_px, self.cy_px)]
 
+    @property
+    def coefficients(self) -> list[float]:
+        """The distortion as files hold it: all of four, five or eight coefficients up to the last that is not zero."""
+        count = next((n for n in (4, 5) if not any(self.distortion[n:])), len(self.distortion))
+        return [float(k) for k in self.distortion[:count]]
+
     def project(self, points: Array) -> tuple[Array, NDArray[np.bool_]]:
         """(N, 3) points to (N, 2) pixels and (N,) whether the lens can see the point (also outside the image)."""
         xy, valid = self._to_plane(np.asarray(points, dtype=np.float64).reshape(-1, 3))
@@ -60,31 +66,35 @@ class CameraModel(ABC):
 
 @dataclass(frozen=True)
 class _Radial:
-    """The polynomial ``x (1 + k_1 x^2 + k_2 x^4 + ...)`` of a radius or an angle, by which both lenses distort."""
+    """What a radius or an angle x is distorted to, ``x (1 + k_1 x^2 + k_2 x^4 + ...)``, of the rational model divided
+    by ``1 + d_1 x^2 + d_2 x^4 + ...``."""
 
     k: tuple[float, ...]
+    d: tuple[float, ...] = ()
 
     def __call__(self, x: Array) -> Array:
         return np.asarray(x * self.factor(x * x))
 
     def factor(self, squared: Array) -> Array:
         """What multiplies x, by its square."""
-        return np.asarray(polyval(squared, (1.0, *self.k)))
+        return np.asarray(polyval(squared, (1.0, *self.k)) / polyval(squared, (1.0, *self.d)))
 
-    @property
-    def _derivative(self) -> list[float]:
-        """Coefficients of the derivative, a polynomial of the square."""
-        return [(2 * i + 1) * c for i, c in enumerate((1.0, *self.k))]
+    def slope(self, squared: Array) -> Array:
+        """Derivative of the factor by the square."""
+        above, below = (1.0, *self.k), (1.0, *self.d)
+        rise = polyval(squared, polyder(above)) - self.factor(squared) * polyval(squared, polyder(below))
+        return np.asarray(rise / polyval(squared, below))
 
     @property
     def limit(self) -> float:
-        """Up to where it grows; infinite if it never folds back."""
-        descending = np.array(self._derivative[::-1])
-        # A vanishing leading coefficient puts its root out of any lens and spoils the others.
-        descending[np.abs(descending) < 1e-12] = 0.0
-        roots = np.roots(np.trim_zeros(descending, "f"))
-        real = roots[np.abs(roots.imag) <= 1e-9 * (1.0 + np.abs(roots.real))].real
-        return float(np.sqrt(real[real > 1e-9].min(initial=np.inf)))
+        """Up to where it grows; infinite if it never folds back.
+
+        With N above and D below, functions of the square s, its derivative is ``(N D + 2 s (N' D - N D')) / D^2``.
+        """
+        above, below = (1.0, *self.k), (1.0, *self.d)
+        bend = polysub(polymul(polyder(above), below), polymul(above, polyder(below)))
+        ends = (polyadd(polymul(above, below), polymul((0.0, 2.0), bend)), np.array(below))
+        return float(np.sqrt(min(map(_first_root, ends))))
 
     def invert(self, target: Array, upper: float) -> Array:
         """Solve for x in [0, upper], where it grows, by Newton steps kept inside a bracket.
@@ -100,7 +110,7 @@ class _Radial:
             residual = self(x) - target
             low, high = np.where(residual <= 0, x, low), np.where(residual >= 0, x, high)
             with np.errstate(divide="ignore", invalid="ignore"):
-                new = x - residual / polyval(x * x, self._derivative)
+                new = x - residual / (self.factor(x * x) + 2 * x * x * self.slope(x * x))
             step = np.abs(new - x)
             rounding = step <= 1e-12 * (1.0 + x)
             good = rounding | ((new >= low) & (new <= high) & (step <= 0.5 * last_step))
@@ -111,12 +121,23 @@ class _Radial:
         return np.where((target >= 0) & (target <= self(np.array(upper))), x, np.nan)
 
 
+def _first_root(ascending: Array) -> float:
+    """The smallest positive root of a polynomial, infinite where there is none."""
+    descending = ascending[::-1].copy()
+    # A vanishing leading coefficient puts its root out of any lens and spoils the others.
+    descending[np.abs(descending) < 1e-12] = 0.0
+    roots = np.roots(np.trim_zeros(descending, "f"))
+    real = roots[np.abs(roots.imag) <= 1e-9 * (1.0 + np.abs(roots.real))].real
+    return float(real[real > 1e-9].min(initial=np.inf))
+
+
 @dataclass(frozen=True)
 class PinholeRadtan(CameraModel):
-    """Pinhole with radial-tangential distortion ``(k1, k2, p1, p2[, k3])`` (D. Brown, 1966; OpenCV's order).
+    """Pinhole with radial-tangential distortion ``(k1, k2, p1, p2[, k3[, k4, k5, k6]])`` (D. Brown, 1966; OpenCV's
+    order): ``1 + k1 r^2 + k2 r^4 + k3 r^6`` times the radius, divided by ``1 + k4 r^2 + k5 r^4 + k6 r^6`` (OpenCV's and
+    ROS's rational model).
 
-    Points at or behind the lens plane, and those beyond the radius where the radial polynomial folds back, are not
-    valid.
+    Points at or behind the lens plane, and those beyond the radius where the radial part folds back, are not valid.
     """
 
     kind: ClassVar[str] = "pinhole-radtan"
@@ -125,11 +146,11 @@ class PinholeRadtan(CameraModel):
 
     @property
     def _radial(self) -> _Radial:
-        return _Radial((*self.distortion[:2], *self.distortion[4:]))
+        return _Radial((*self.distortion[:2], *self.distortion[4:5]), self.distortion[5:8])
 
     @property
     def max_radius(self) -> float:
-        """Largest undistorted radius (tangent of the angle) up to which the radial polynomial grows."""
+        """Largest undistorted radius (tangent of the angle) up to which the radial part grows."""
         return self._radial.limit
 
     def _distort(self, xy: Array) -> Array:
@@ -143,11 +164,10 @@ class PinholeRadtan(CameraModel):
 
     def _jacobian(self, xy: Array) -> tuple[Array, Array, Array]:
         """Derivatives of the distorted x by x and y by y, (N,) each, and of each by the other, which are equal."""
-        k1, k2, p1, p2, k3 = (*self.distortion, 0.0)[:5]
+        p1, p2 = self.distortion[2:4]
         x, y = xy[:, 0], xy[:, 1]
         r2 = x * x + y * y
-        radial = self._radial.factor(r2)
-        slope = 2 * (k1 + r2 * (2 * k2 + r2 * 3 * k3))
+        radial, slope = self._radial.factor(r2), 2 * self._radial.slope(r2)
         x_by_x = radial + x * x * slope + 2 * p1 * y + 6 * p2 * x
         y_by_y = radial + y * y * slope + 6 * p1 * y + 2 * p2 * x
         return x_by_x, y_by_y, x * y * slope + 2 * p1 * x + 2 * p2 * y

@@ -6,7 +6,7 @@ KITTI odometry's ``calib.txt``.
 from __future__ import annotations
 
 import re
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -142,7 +142,9 @@ def _of_matrix(K: Array) -> tuple[float, float, float, float]:
 
 @dataclass(frozen=True)
 class CameraInfo:
-    """The fields of the message: ``K`` (3, 3), ``D`` (n,), ``R`` (3, 3), ``P`` (3, 4), size [px]."""
+    """The fields of the message: ``K`` (3, 3), ``D`` (n,), ``R`` (3, 3), ``P`` (3, 4), size [px], all of the whole
+    sensor; ``window``: its x, y, width and height [px] that images show, zeros for all; ``binning``: pixels of it in
+    one of an image, along x and y."""
 
     width: int
     height: int
@@ -151,6 +153,26 @@ class CameraInfo:
     K: Array
     R: Array
     P: Array
+    window: tuple[int, int, int, int] = (0, 0, 0, 0)
+    binning: tuple[int, int] = (1, 1)
+
+    def of_images(self, size: tuple[int, int]) -> CameraInfo:
+        """That of images of ``size`` (width, height), without window and binning: as they say, unless the images are as
+        large as the calibration, which some drivers state for the binned ones.
+
+        Of a binned pixel the centre is the middle of those that it is made of, in images that were rectified after it
+        as well (``sensor_msgs/CameraInfo``; image_geometry leaves out that half of a pixel).
+        """
+        x, y, width, height = self.window
+        width, height = (
+            (n or whole) // b for n, whole, b in zip((width, height), (self.width, self.height), self.binning)
+        )
+        whole = replace(self, window=(0, 0, 0, 0), binning=(1, 1))
+        if size == (self.width, self.height):
+            return whole
+        bx, by = self.binning
+        A = np.array([[1 / bx, 0, (0.5 - x) / bx - 0.5], [0, 1 / by, (0.5 - y) / by - 0.5], [0, 0, 1]])
+        return replace(whole, width=width, height=height, K=A @ self.K, P=A @ self.P)
 
 
 def _read_camera_infos(path: Path) -> StereoRig:

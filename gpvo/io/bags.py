@@ -97,7 +97,7 @@ class BagSource(ImageSource):
             self._topics = _choose_topics(reader, path, chain, asked, any_truth=truth_frame is not None)
             sizes, first = _first_images(reader, path, self._topics)
             is_placed = TF_STATIC in topics_of(reader, (TF_TYPE,))
-            rig = read_stereo_yaml(chain, size=sizes[0]) if chain else _rig_from_bag(reader, path, self._topics)
+            rig = read_stereo_yaml(chain, size=sizes[0]) if chain else _rig_from_bag(reader, path, self._topics, sizes)
             for size, lens, topic in zip(sizes, (rig.left, rig.right), (self._topics.left, self._topics.right)):
                 check_size(f"images on '{topic}' are", size, lens, path)
         super().__init__(path, path.stem if path.is_file() else path.resolve().name, rig, **options)
@@ -301,17 +301,17 @@ def _span(first: list[int], count: int) -> tuple[int, int]:
     return begin, begin + round(usual_ns * (count - 1))
 
 
-def _rig_from_bag(reader: Any, path: Path, topics: _Topics) -> StereoRig:
+def _rig_from_bag(reader: Any, path: Path, topics: _Topics, sizes: list[tuple[int, int]]) -> StereoRig:
     infos = []
     available = topics_of(reader, (INFO_TYPE,))
-    for topic in (topics.left, topics.right):
+    for topic, size in zip((topics.left, topics.right), sizes, strict=True):
         name = info_topic(topic)
         if name not in available:
             text = f"no calibration: no CameraInfo on '{name}' and no camchain.yaml beside the bag"
             cure = "put Kalibr's camchain.yaml beside the bag or name one with --calibration"
             raise CalibrationError(text, where=path, cure=cure)
         _, message = next(messages(reader, [name]))
-        infos.append(camera_info_of(message, path, name))
+        infos.append(camera_info_of(message, path, name).of_images(size))
     rectified = has_word("rect", topics.left, topics.right)
     return rig_from_camera_info(infos[0], infos[1], rectified=rectified, where=path)
 
@@ -338,5 +338,9 @@ def camera_info_of(message: Any, where: object, topic: str) -> CameraInfo:
     if not all(np.isfinite(m).all() for m in (D, K, R, P)):
         raise CalibrationError(f"CameraInfo on '{topic}' holds NaN or infinity", where=where)
     R = R.reshape(3, 3) if np.any(R) else np.eye(3)
-    size = int(message.width), int(message.height)
-    return CameraInfo(*size, str(message.distortion_model), D=D, K=K.reshape(3, 3), R=R, P=P.reshape(3, 4))
+    size, roi = (int(message.width), int(message.height)), message.roi
+    return CameraInfo(
+        *size, str(message.distortion_model), D=D, K=K.reshape(3, 3), R=R, P=P.reshape(3, 4),
+        window=(int(roi.x_offset), int(roi.y_offset), int(roi.width), int(roi.height)),
+        binning=(int(message.binning_x) or 1, int(message.binning_y) or 1),
+    )  # fmt: skip

@@ -122,7 +122,7 @@ class StereoStage:
             pairs = self._pairs.push(topic, message)
             self.counts["unpaired"] += self._report.missing - missing
             for pair in pairs:
-                self._take_size(pair[1])
+                self._take_sizes(*pair[1:])
                 if self._rectifier is not None:
                     yield from self.flush()
                 elif len(self._waiting) == _PAIRS_KEPT:
@@ -194,21 +194,28 @@ class StereoStage:
         if not self.wants_info:
             return
         self._infos[topic] = camera_info_of(message, topic, topic)
-        names = [info_topic(t) for t in (self.left, self.right)]
-        if all(n in self._infos for n in names):
-            rectified = has_word("rect", self.left, self.right)
-            self._calibrate(rig_from_camera_info(*(self._infos[n] for n in names), rectified=rectified, where=names[1]))
+        if self._waiting:
+            self._take_sizes(*self._waiting[0][1:3])
 
     @property
     def wants_info(self) -> bool:
         """Whether the calibration is still to come, by CameraInfo."""
         return self.camera is None and self._without_size is None
 
-    def _take_size(self, message: Any) -> None:
-        if self._without_size is not None and (image := decode_message(message)) is not None:
-            height, width = image.shape
-            self._calibrate(read_stereo_yaml(self._without_size, size=(width, height)))
-            self._without_size = None
+    def _take_sizes(self, left: Any, right: Any) -> None:
+        """Calibrate by what says everything but what size the images are, or how much of the sensor they show."""
+        names = [info_topic(t) for t in (self.left, self.right)]
+        if self.camera is not None or (self.wants_info and not all(n in self._infos for n in names)):
+            return
+        sizes = [(i.shape[1], i.shape[0]) for i in map(decode_message, (left, right)) if i is not None]
+        if len(sizes) < 2:
+            return
+        if self._without_size is not None:
+            self._calibrate(read_stereo_yaml(self._without_size, size=sizes[0]))
+            return
+        left_info, right_info = (self._infos[n].of_images(size) for n, size in zip(names, sizes))
+        rectified = has_word("rect", self.left, self.right)
+        self._calibrate(rig_from_camera_info(left_info, right_info, rectified=rectified, where=names[1]))
 
     def _calibrate(self, rig: StereoRig) -> None:
         if self._masks is not None:

@@ -274,7 +274,7 @@ def _lens(lens: CameraModel, coefficients: str, radtan: str) -> dict[str, Any]:
         "camera_model": "pinhole",
         "intrinsics": lens.intrinsics_px,
         "distortion_model": "equidistant" if fisheye else radtan,
-        f"distortion_{coefficients}": [float(k) for k in lens.distortion[: 5 if any(lens.distortion[4:]) else 4]],
+        f"distortion_{coefficients}": lens.coefficients,
         "resolution": [lens.width, lens.height],
     }
 

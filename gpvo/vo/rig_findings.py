@@ -285,7 +285,7 @@ def camchain(rig: StereoRig) -> str:
             "camera_model": "pinhole",
             "intrinsics": lens.intrinsics_px,
             "distortion_model": "equidistant" if len(lens.distortion) == 4 else "radtan",
-            "distortion_coeffs": lens.distortion if any(lens.distortion[4:]) else lens.distortion[:4],
+            "distortion_coeffs": lens.coefficients,
             "resolution": [lens.width, lens.height],
         }
         if rig.T_imu_left is not None:

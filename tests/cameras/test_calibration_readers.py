@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import cv2
 import numpy as np
 import pytest
@@ -240,6 +242,37 @@ def test_camera_info_gives_back_the_rig():
         rig_from_camera_info(blank, right, rectified=False)
 
 
+WINDOW = (64, 40, 512, 384)
+
+
+@pytest.mark.parametrize("D", [(-0.28, 0.07, 2e-4, 2e-5, 0.0), (0.8, 0.05, 2e-4, 2e-5, 1e-3, 1.1, 0.12, 3e-3)])
+@pytest.mark.parametrize("rectified", [False, True])
+def test_camera_info_of_a_window_with_binned_pixels(D, rectified):
+    """A pixel of the image covers two columns and three rows of the window; its centre is the middle of theirs."""
+    lens = PinholeRadtan(458.0, 457.0, 367.0, 248.0, 752, 480, D)
+    rectifier = Rectifier(StereoRig(lens, lens, T_RIGHT_LEFT))
+    c = rectifier.camera
+    ends = ((rectifier.R_rect_left, 0.0), (rectifier.R_rect_right, -c.fx_px * c.baseline_m))
+    whole = [replace(_info(rectifier, lens, *end), distortion_model="rational_polynomial") for end in ends]
+    shown = [replace(info, window=WINDOW, binning=(2, 3)) for info in whole]
+    a, b = (
+        rig_from_camera_info(*infos, rectified=rectified)
+        for infos in (whole, [info.of_images((256, 128)) for info in shown])
+    )
+    np.testing.assert_allclose(b.T_right_left, a.T_right_left, atol=1e-12)
+    points = np.array([[0.1, -0.2, 2.0], [-0.4, 0.3, 3.0], [0.0, 0.0, 1.0]])
+    for of_all, of_window in ((a.left, b.left), (a.right, b.right)):
+        assert (of_window.width, of_window.height) == (256, 128)
+        expected = (of_all.project(points)[0] - WINDOW[:2] + 0.5) / (2, 3) - 0.5
+        np.testing.assert_allclose(of_window.project(points)[0], expected, atol=1e-9)
+
+
+def test_camera_info_that_states_the_binned_size_needs_no_binning():
+    info = CameraInfo(752, 480, "plumb_bob", np.zeros(5), np.eye(3), np.eye(3), np.ones((3, 4)), binning=(2, 2))
+    assert info.of_images((752, 480)).K.tolist() == np.eye(3).tolist()
+    assert (info.of_images((752, 480)).width, info.of_images((1, 1)).width) == (752, 376)
+
+
 def opencv_matrix(name, M) -> str:
     M = np.atleast_2d(M)
     data = ", ".join(repr(float(v)) for v in M.ravel())
@@ -274,6 +307,15 @@ def test_four_coefficients_of_opencv_may_be_of_either_lens(write):
         assert isinstance(read_stereo_yaml(write(f"{text}{line}\n")).left, kind)
     for D in ([0.0] * 4, [0.1, 0.0, 0.0, 0.0, 0.0]):
         assert isinstance(read_opencv_stereo(write(opencv_stereo(K, D)), size=(640, 480)).left, PinholeRadtan)
+
+
+def test_eight_coefficients_of_opencv_are_rational_and_more_are_refused(write):
+    K = np.array([[286.0, 0, 319.0], [0, 286.5, 239.0], [0, 0, 1.0]])
+    D = [0.8, 0.05, 1e-3, -2e-3, 1e-3, 1.1, 0.12, 3e-3]
+    for coefficients in (D, [*D, 0.0, 0.0, 0.0, 0.0]):
+        assert read_opencv_stereo(write(opencv_stereo(K, coefficients)), size=(640, 480)).left.distortion == tuple(D)
+    with pytest.raises(CalibrationError, match="thin prism"):
+        read_opencv_stereo(write(opencv_stereo(K, [*D, 1e-3, 0.0, 0.0, 0.0])), size=(640, 480))
 
 
 @pytest.mark.parametrize("names", [("M", "D"), ("cameraMatrix", "distCoeffs")])

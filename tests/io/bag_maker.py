@@ -50,15 +50,21 @@ class BagMaker:
         message = self.type("sensor_msgs/msg/CompressedImage")(header=self.header(t_ns), format=encoding, data=data)
         self.add(topic, message, t_ns)
 
-    def camera_info(self, topic: str, t_ns: int, tx: float) -> None:
+    def camera_info(self, topic: str, t_ns: int, tx: float, corner: tuple[int, int] | None = None) -> None:
+        """``corner``: of the window of a larger sensor that the images show, two by two pixels in one."""
         names = "DKRP" if self.ros1 else "dkrp"
-        K = np.array([60.0, 0, 31.5, 0, 60.0, 23.5, 0, 0, 1])
-        P = np.array([60.0, 0, 31.5, tx, 0, 60.0, 23.5, 0, 0, 0, 1, 0])
-        roi = self.type("sensor_msgs/msg/RegionOfInterest")(0, 0, 0, 0, False)
+        f, cx, cy, width, height, bins, window = 60.0, 31.5, 23.5, seq.WIDTH, seq.HEIGHT, 0, (0, 0, 0, 0)
+        if corner is not None:
+            f, tx, cx, cy, bins = 2 * f, 2 * tx, 63.5 + corner[0], 47.5 + corner[1], 2
+            window = (*corner, 2 * height, 2 * width)
+            width, height = 200, 150
+        K = np.array([f, 0, cx, 0, f, cy, 0, 0, 1])
+        P = np.array([f, 0, cx, tx, 0, f, cy, 0, 0, 0, 1, 0])
+        roi = self.type("sensor_msgs/msg/RegionOfInterest")(*window, False)
         values = dict(zip(names, (np.zeros(5), K, np.eye(3).ravel(), P), strict=True))
         message = self.type("sensor_msgs/msg/CameraInfo")(
-            header=self.header(t_ns), height=seq.HEIGHT, width=seq.WIDTH, distortion_model="plumb_bob",
-            binning_x=0, binning_y=0, roi=roi, **values,
+            header=self.header(t_ns), height=height, width=width, distortion_model="plumb_bob",
+            binning_x=bins, binning_y=bins, roi=roi, **values,
         )  # fmt: skip
         self.add(topic, message, t_ns)
 

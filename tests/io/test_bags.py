@@ -345,6 +345,19 @@ def test_a_bag_of_colour_images(tmp_path):
     assert [k for _, k in seq.frames_of(source)] == [0, 1, 2]
 
 
+def test_images_of_a_window_with_binned_pixels(tmp_path):
+    """As if the calibration were of the images themselves."""
+    cameras = []
+    for corner in (None, (12, 8)):
+        maker = BagMaker(ros1=False)
+        for k, t in enumerate(seq.stamps(3)):
+            for side, tx in (("left", 0.0), ("right", -6.0)):
+                maker.image(f"/{side}/image_raw", t, seq.grey(k))
+                maker.camera_info(f"/{side}/camera_info", t, tx, corner)
+        cameras.append(open_source(maker.write(tmp_path / f"{corner is None}")).camera)
+    assert cameras[0] == cameras[1]
+
+
 def test_compressed_images_with_camchain_beside(tmp_path):
     maker = BagMaker(ros1=False)
     for k, t in enumerate(seq.stamps(3)):

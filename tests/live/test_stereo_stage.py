@@ -76,7 +76,7 @@ def test_a_bag_with_imu_and_camera_info(settings: str, tmp_path: Path) -> None:
     _equal([t.record for t in taken], theirs)
 
 
-@pytest.mark.parametrize("which", ["12 bits", "5 ms apart", "zeros", "-1", "nan"])
+@pytest.mark.parametrize("which", ["12 bits", "5 ms apart", "window", "zeros", "-1", "nan"])
 def test_what_a_run_reads_is_read_live(which: str, tmp_path: Path) -> None:
     maker, seen = BagMaker(ros1=True), {"12 bits": {"bits": 12}, "5 ms apart": {"tolerance_s": 0.006}}.get(which, {})
     acc = {"-1": (1.0, 0.0, 0.0), "nan": (np.nan,) * 3}.get(which, (0.0, 0.0, 0.0))
@@ -84,7 +84,8 @@ def test_what_a_run_reads_is_read_live(which: str, tmp_path: Path) -> None:
         for side, late_ns, tx in (("left", 0, 0.0), ("right", 5_000_000 * (which == "5 ms apart"), -6.0)):
             image = seq.grey(k).astype(np.uint16) << 4 if which == "12 bits" else seq.grey(k)
             maker.image(f"/camera/{side}/image_raw", t + late_ns, image, "mono16" if which == "12 bits" else "mono8")
-            maker.camera_info(f"/camera/{side}/camera_info", t, tx)
+            corner = (12, 8) if which == "window" else None
+            maker.camera_info(f"/camera/{side}/camera_info", t, tx, corner)
         maker.imu("/imu0", t, (0.1 * k, 0.2, 0.3), acc, known=(0.0, -1.0 if which == "-1" else 0.0))
     bag = maker.write(tmp_path / "stereo.bag")
     theirs = [s.record for s in runner.steps(open_source(bag, prefetch=False, **seen), make_config())]

@@ -12,6 +12,10 @@ cv2 = pytest.importorskip("cv2")
 
 EUROC = PinholeRadtan(458.654, 457.296, 367.215, 248.375, 752, 480, (-0.28340811, 0.07395907, 0.00019359, 1.76e-05))
 FIVE = PinholeRadtan(520.0, 521.0, 319.0, 241.0, 640, 480, (0.12, -0.25, 0.001, -0.0007, 0.11))
+RATIONAL = PinholeRadtan(
+    605.0, 605.5, 638.0, 366.0, 1280, 720, (0.5075, -2.6437, 8e-4, -2e-4, 1.5226, 0.3857, -2.4617, 1.4481)
+)
+WIDE = PinholeRadtan(280.0, 281.0, 321.0, 239.0, 640, 480, (0.8, 0.05, 1e-3, -2e-3, 1e-3, 1.1, 0.12, 3e-3))
 TUMVI = KannalaBrandt(
     190.978477, 190.973307, 254.931706, 256.897442, 512, 512, (0.0034823894, 0.0007150348, -0.0020532361, 0.00020293673)
 )
@@ -25,7 +29,7 @@ def _points(rng, lens, spread):
     return np.concatenate([xy, np.ones((500, 1))], axis=1) * rng.uniform(0.3, 20, size=(500, 1))
 
 
-@pytest.mark.parametrize("lens", [EUROC, FIVE], ids=["euroc", "five"])
+@pytest.mark.parametrize("lens", [EUROC, FIVE, RATIONAL, WIDE], ids=["euroc", "five", "rational", "wide"])
 def test_radtan_projects_as_opencv(lens):
     P = _points(np.random.default_rng(0), lens, 0.6)
     K = np.array([[lens.fx_px, 0, lens.cx_px], [0, lens.fy_px, lens.cy_px], [0, 0, 1.0]])
@@ -34,6 +38,17 @@ def test_radtan_projects_as_opencv(lens):
     assert valid.all()
     # 1e-9 rad at this focal length.
     np.testing.assert_allclose(ours, theirs, atol=1e-9 * lens.fx_px)
+
+
+@pytest.mark.parametrize("lens", [EUROC, RATIONAL, WIDE], ids=["euroc", "rational", "wide"])
+def test_radtan_unprojects_as_opencv_does_after_many_steps(lens):
+    u, v = np.meshgrid(np.linspace(0, lens.width - 1, 33), np.linspace(0, lens.height - 1, 25))
+    uv = np.column_stack([u.ravel(), v.ravel()])
+    K = np.array([[lens.fx_px, 0, lens.cx_px], [0, lens.fy_px, lens.cy_px], [0, 0, 1.0]])
+    criteria = (cv2.TERM_CRITERIA_EPS | cv2.TERM_CRITERIA_COUNT, 500, 1e-14)
+    theirs = cv2.undistortPointsIter(uv[:, None], K, np.array(lens.distortion), None, None, criteria)[:, 0]
+    ours = lens.unproject(uv)
+    np.testing.assert_allclose(ours[:, :2] / ours[:, 2:], theirs, atol=1e-9)
 
 
 @pytest.mark.parametrize("lens", [TUMVI, T265], ids=["tumvi", "t265"])

@@ -192,10 +192,10 @@ def test_the_camera_of_a_kitti_folder(tmp_path):
         camera_rig(str(tmp_path / "calib.txt"))
 
 
-@pytest.mark.parametrize("k3", [0.0, -0.25])
-def test_the_written_calibration_is_that_of_the_rig(k3, tmp_path):
+@pytest.mark.parametrize("more", [(0.0,), (-0.25,), (0.0, 0.0, 0.02, 0.001)])
+def test_the_written_calibration_is_that_of_the_rig(more, tmp_path):
     rig = camera_rig("euroc")
-    left, right = (replace(lens, distortion=(-0.3, 0.12, 1e-3, -5e-4, k3)) for lens in (rig.left, rig.right))
+    left, right = (replace(lens, distortion=(-0.3, 0.12, 1e-3, -5e-4, *more)) for lens in (rig.left, rig.right))
     sequence._write_calibration(tmp_path, replace(rig, left=left, right=right), 20.0, 0.0)
     pair = read_sensor_pair(*(tmp_path / "mav0" / f"cam{k}" / "sensor.yaml" for k in (0, 1)))
     chain = read_camchain(tmp_path / "dso" / "camchain.yaml")
