@@ -38,7 +38,10 @@ def flight_of(run: Run, predictor: Predictor | None = None, *, use_imu: bool = T
         raise GpvoError(f"holds {len(run.log)} records: nothing to fuse", where=run.path)
     imu = run.imu if use_imu else None
     if imu is not None and run.mounting.T_imu_cam is None:
-        cure = "run it with --calibration CAMCHAIN, Kalibr's file with T_cam_imu, or fuse it with --no-imu"
+        cure = (
+            "run it with --calibration CAMCHAIN, Kalibr's file with T_cam_imu, or a bag whose /tf_static joins IMU and "
+            "camera; or fuse it with --no-imu"
+        )
         raise GpvoError("has an IMU, but nothing says where it sits on the camera", where=run.path, cure=cure)
     poses = valid = None
     truth_sigma = (0.0, 0.0)

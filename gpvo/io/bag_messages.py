@@ -321,16 +321,17 @@ def accelerometer_beside(gyroscope: str) -> str | None:
 
 def read_imu(
     path: Path, candidates: list[tuple[str, ...]], shift_s: float, remark: Callable[[str], None]
-) -> ImuLog | None:
-    """The first of the candidates that measures rates, in the camera's time by ``t_imu = t_cam + shift_s``.
+) -> tuple[ImuLog, str] | None:
+    """The first of the candidates that measures rates, in the camera's time by ``t_imu = t_cam + shift_s``, and the
+    name of its frame.
 
     An accelerometer of its own is interpolated onto the gyroscope's stamps, inside the time that both cover.
     ``acc_mps2`` is NaN throughout where nothing measured it.
     """
     for topics in candidates:
-        t_ns, data = _samples(path, topics[0])
+        t_ns, data, frame = _samples(path, topics[0])
         if len(topics) == 2:
-            t_ns, data = with_accelerometer(t_ns, data, *_samples(path, topics[1]))
+            t_ns, data = with_accelerometer(t_ns, data, *_samples(path, topics[1])[:2])
         no_acc = bool(np.isnan(data[:, 3:]).all())
         good = np.isfinite(data[:, :3]).all(axis=1) & (no_acc | np.isfinite(data[:, 3:]).all(axis=1))
         if not good.any():
@@ -341,17 +342,18 @@ def read_imu(
             remark(f"'{topics[0]}' is a gyroscope only: it measures no acceleration")
         elif len(topics) == 2:
             remark(f"IMU of '{topics[0]}', with '{topics[1]}' interpolated onto its stamps")
-        return make_imu(t_ns[good], data[good], shift_s=shift_s, remark=remark)
+        return make_imu(t_ns[good], data[good], shift_s=shift_s, remark=remark), frame
     return None
 
 
-def _samples(path: Path, topic: str) -> tuple[Stamps, Array]:
+def _samples(path: Path, topic: str) -> tuple[Stamps, Array, str]:
     """Stamps (N,) and samples (N, 6), gyro first; NaN where the topic does not measure: its covariance begins with -1,
-    as ROS has it, or nothing but exact zeros came."""
-    stamps, rows = array("q"), array("d")  # of hours: lists of numbers take several times as much
+    as ROS has it, or nothing but exact zeros came. And the frame that the last one names."""
+    frame, stamps, rows = "", array("q"), array("d")  # of hours: lists of numbers take several times as much
     with open_bag(path) as reader:
         for _, m in messages(reader, [topic]):
             stamps.append(stamp_ns(m))
+            frame = m.header.frame_id
             measured = (m.angular_velocity, m.linear_acceleration)
             covariances = (m.angular_velocity_covariance, m.linear_acceleration_covariance)
             for v, C in zip(measured, covariances):
@@ -360,7 +362,7 @@ def _samples(path: Path, topic: str) -> tuple[Stamps, Array]:
     for values in (data[:, 0], data[:, 1]):
         if (values[:, 3] == -1).all() or not values[:, :3].any():
             values[:] = np.nan
-    return np.array(stamps, dtype=np.int64), data[:, :, :3].reshape(-1, 6)
+    return np.array(stamps, dtype=np.int64), data[:, :, :3].reshape(-1, 6), frame_name(frame)
 
 
 def with_accelerometer(t_ns: Stamps, data: Array, t_acc_ns: Stamps, acc_data: Array) -> tuple[Stamps, Array]:

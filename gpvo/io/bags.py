@@ -67,8 +67,9 @@ class BagSource(ImageSource):
 
     Topics are guessed from the calibration's ``rostopic`` or the drivers' habits; ``left_topic``, ``right_topic``,
     ``imu_topic`` and ``truth_topic`` (``"none"`` for no truth) override. Stamps of a pair may differ by
-    ``tolerance_s``. ``truth_frame`` (``"imu"`` or ``"cam"``) says whose poses the truth topic holds: the IMU's where
-    its place is known, unless stated. Poses of motion capture are guessed to be the truth only with ``truth_frame``:
+    ``tolerance_s``. The place of an IMU that the calibration does not know is that of its frame by /tf_static.
+    ``truth_frame`` (``"imu"`` or ``"cam"``) says whose poses the truth topic holds: the IMU's where the calibration
+    knows its place, unless stated. Poses of motion capture are guessed to be the truth only with ``truth_frame``:
     its markers rarely sit where the IMU does. ``bits`` is the depth of the samples in 16-bit images. ``base_frame``:
     the robot's frame that becomes the body, located through /tf_static and /tf from that of the left images.
     """
@@ -107,9 +108,13 @@ class BagSource(ImageSource):
             self._place(frame_name(base_frame))
         elif is_placed and self.mounting.T_body_cam is None:
             self._say_where_placed()
-        self.imu = read_imu(path, self._topics.imu, rig.timeshift_cam_imu_s, self.remark)
-        if self.imu is not None and (self.imu.t_ns[0] > span[1] or self.imu.t_ns[-1] < span[0]):
-            self.remark("the IMU does not overlap the images in time, so it says nothing of them: two clocks?")
+        measured = read_imu(path, self._topics.imu, rig.timeshift_cam_imu_s, self.remark)
+        if measured is not None:
+            self.imu, frame = measured
+            if self.imu.t_ns[0] > span[1] or self.imu.t_ns[-1] < span[0]:
+                self.remark("the IMU does not overlap the images in time, so it says nothing of them: two clocks?")
+            if is_placed and self.mounting.T_imu_cam is None:
+                self._place_imu(frame)
         if self._topics.truth is not None:
             self.truth = self._read_truth(self._topics.truth, truth_frame)
         if self._topics.doubtful is not None:
@@ -153,6 +158,22 @@ class BagSource(ImageSource):
             raise SourceError(f"{told}, the frame of the left images", where=self.path, cure=cure)
         self.mounting = replace(self.mounting, T_body_cam=T_base_camera @ self.rectifier.T_left_cam, body=base)
 
+    def _place_imu(self, imu: str) -> None:
+        """Take the place of the IMU from the bag's static transforms. One name for both frames, as some drivers have
+        it, says nothing."""
+        with open_bag(self.path) as reader:
+            camera = _camera_frame(reader, self._topics.left)
+            joined = f"{TF_STATIC} ('{printable(imu)}' to '{printable(camera)}')"
+            try:
+                T_imu_camera = None if imu == camera else _place_of(reader, imu, camera, (TF_STATIC,), self.path)
+            except SourceError:
+                self.remark(f"where the IMU sits on the camera is not taken from {joined}: it changes")
+                return
+        if T_imu_camera is not None:
+            self.mounting = replace(self.mounting, T_imu_cam=T_imu_camera @ self.rectifier.T_left_cam)
+            told = "a calibration with T_cam_imu would be used instead"
+            self.remark(f"where the IMU sits on the camera is taken from {joined}; {told}")
+
     def _say_where_placed(self) -> None:
         """That the bag places its camera on a base_link, which is not used; what it says may as well be of no use."""
         try:
@@ -174,7 +195,7 @@ class BagSource(ImageSource):
         if frame == "imu" and self.mounting.T_imu_cam is None:
             cure = "give --calibration CAMCHAIN with T_cam_imu, or --truth-frame cam"
             raise CalibrationError("does not say where the IMU sits", where=self.path, cure=cure)
-        whose = frame or ("cam" if self.mounting.T_imu_cam is None else "imu")
+        whose = frame or ("cam" if self.rectifier.rig.T_imu_left is None else "imu")
         place = self.rectifier.T_left_cam if whose == "cam" else self.mounting.T_imu_cam
         assert place is not None
         self.remark(f"truth on '{topic}' taken as poses of the {whose} frame")

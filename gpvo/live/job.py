@@ -91,8 +91,9 @@ class Live:
         predictor, outputs = Predictor.load(settings.model), _outputs(settings, wire)
         self._settings, self._wire, self._tell = settings, wire, tell
         self._topics = topics_in(stage, settings)
+        needed = [t for t, kind in self._topics.items() if kind != TF_TYPE or settings.base_frame is not None]
         self.engine = Engine(
-            stage, predictor, outputs, tell=tell, truth=truth, topics=self._topics,
+            stage, predictor, outputs, tell=tell, truth=truth, topics=needed,
             increment=settings.pose_covariance == "increment", state=settings.state, vehicle=settings.vehicle,
         )  # fmt: skip
         self._mailbox = Mailbox(settings.depth)
@@ -219,7 +220,9 @@ def topics_in(stage: Stage, settings: LiveSettings) -> dict[str, str]:
     assert isinstance(stage, StereoStage)
     images = {t: IMAGE_TYPES[has_word("compressed", t)] for t in (stage.left, stage.right)}
     infos = {info_topic(t): INFO_TYPE for t in images} if stage.wants_info else {}
-    return {**images, **infos, **dict.fromkeys(filter(None, (stage.imu, stage.accelerometer)), IMU_TYPE), **truth}
+    placing = {TF_STATIC: TF_TYPE} if stage.wants_place else {}
+    imu = dict.fromkeys(filter(None, (stage.imu, stage.accelerometer)), IMU_TYPE)
+    return {**images, **infos, **imu, **placing, **truth}
 
 
 def open_wire(name: str, address: str | None = None, domain: int = 0) -> Wire:

@@ -14,8 +14,16 @@ from gpvo.cameras.readers import CameraInfo, read_projections, read_stereo_yaml,
 from gpvo.cameras.rectify import Rectifier, read_mask
 from gpvo.cameras.rig import StereoRig
 from gpvo.geometry.se3 import T_FLU_OPTICAL
-from gpvo.io.bag_messages import PairQueue, accelerometer_beside, decode_message, encoding_of, with_accelerometer
-from gpvo.io.bag_reader import stamp_ns
+from gpvo.io.bag_messages import (
+    FrameTree,
+    PairQueue,
+    accelerometer_beside,
+    decode_message,
+    encoding_of,
+    frame_name,
+    with_accelerometer,
+)
+from gpvo.io.bag_reader import TF_STATIC, stamp_ns
 from gpvo.io.bags import camera_info_of, has_word, info_topic
 from gpvo.io.images import SWAPPED, Image8, OrderCheck
 from gpvo.io.source import Depth, SourceReport
@@ -58,7 +66,8 @@ class StereoStage:
 
     ``rig``: the calibration, or the file of one that does not state the size of the images, as KITTI's: it is read when
     the first pair tells. Without one pairs, ten at most, wait for CameraInfo beside the image topics. A pair waits for
-    the first IMU sample after it, or for the next pair.
+    the first IMU sample after it, or for the next pair. Where the ``rig`` does not know the place of the IMU, static
+    transforms between the frames of IMU and left images tell it, from when they come.
 
     Raises GpvoError if a file of the ``settings`` cannot be used, or does not fit the ``rig``.
     """
@@ -89,6 +98,8 @@ class StereoStage:
         self.camera: StereoCamera | None = None
         self.T_body_cam, self.T_source_cam = T_FLU_OPTICAL, np.eye(4)
         self._shift_ns = 0
+        self._tree, self._imu_frame = FrameTree(), ""
+        self._T_imu_cam: Array | None = None
         self._without_size: Path | None = None
         if isinstance(rig, StereoRig):
             self._calibrate(rig)
@@ -113,6 +124,9 @@ class StereoStage:
     def take(self, arrival: Arrival) -> Iterator[Taken]:
         """A record for each pair that is complete, with the IMU's samples since the one before."""
         topic, message = arrival.topic, arrival.message
+        if topic == TF_STATIC:
+            self._tree.take(message)
+            return
         if topic == self.imu:
             self._take_imu(message)
         elif topic == self.accelerometer:
@@ -181,11 +195,19 @@ class StereoStage:
             return
         begins = self._odometry is None
         if self._odometry is None:
-            place = self._rectifier.mounting.T_imu_cam
-            self._odometry = StereoOdometry(self.camera, self.settings.config, self._rectifier.mask, self._state, place)
+            place, mask = self._T_imu_cam, self._rectifier.mask
+            self._odometry = StereoOdometry(self.camera, self.settings.config, mask, self._state, place)
+        if self._T_imu_cam is None and self.imu is not None:
+            self._place_imu(self._odometry, frame_name(left.header.frame_id))
         record = self._odometry.step(frame, None if begins else self._imu_since(t_ns))
         self._t_last_ns = t_ns
         yield Taken(record, begins, received_ns)
+
+    def _place_imu(self, odometry: StereoOdometry, camera: str) -> None:
+        T_imu_camera = self._tree.transform(self._imu_frame, camera)
+        if T_imu_camera is not None and self._imu_frame != camera:  # one name for both, as some drivers have it
+            self._T_imu_cam = T_imu_camera @ self.T_source_cam
+            odometry.place_imu(self._T_imu_cam)
 
     def _restart(self) -> None:
         self._odometry, self._t_last_ns = None, 0
@@ -201,6 +223,11 @@ class StereoStage:
     def wants_info(self) -> bool:
         """Whether the calibration is still to come, by CameraInfo."""
         return self.camera is None and self._without_size is None
+
+    @property
+    def wants_place(self) -> bool:
+        """Whether no calibration says where the IMU sits on the camera."""
+        return self.imu is not None and self._T_imu_cam is None
 
     def _take_sizes(self, left: Any, right: Any) -> None:
         """Calibrate by what says everything but what size the images are, or how much of the sensor they show."""
@@ -225,7 +252,7 @@ class StereoStage:
             self._state = read_state(self.settings.calibration_state, rectifier.camera)
         self._rectifier, self.camera = rectifier, rectifier.camera
         self._shift_ns = round(rig.timeshift_cam_imu_s * 1e9)
-        self.T_source_cam = self._rectifier.T_left_cam
+        self.T_source_cam, self._T_imu_cam = self._rectifier.T_left_cam, self._rectifier.mounting.T_imu_cam
         place = self._rectifier.mounting.T_body_cam
         self.T_body_cam = T_FLU_OPTICAL if place is None else place
 
@@ -235,6 +262,7 @@ class StereoStage:
         self._measures |= np.isfinite(row).all(axis=1) & row.any(axis=1)
         row[~self._measures] = np.nan
         known = np.asarray(np.isfinite(row).all(axis=1))
+        self._imu_frame = frame_name(message.header.frame_id)
         t_ns = stamp_ns(message)
         seen = self._imu_watch.see(t_ns)
         if seen.dropped or not known[0] or known[1] != self._measures[1]:

@@ -84,6 +84,12 @@ class StereoOdometry:
         self._raw = EMPTY  # the last matches as measured
         self.last: Followed = Followed(EMPTY, np.zeros(0, bool))
 
+    def place_imu(self, T_imu_cam: Array) -> None:
+        """From here on, the left camera sits at ``T_imu_cam`` (4, 4) on the IMU, of which nothing was known before."""
+        self._T_imu_cam = T_imu_cam
+        if self._state is not None:
+            self._state.place_imu(T_imu_cam)
+
     def step(self, frame: StereoFrame | TrackFrame, imu: ImuLog | None = None) -> VoRecord:
         """Process one frame: how the camera moved since the reference frame.
 

@@ -85,8 +85,14 @@ class State:
     @classmethod
     def begin(cls, t_ns: int, points: int, T_imu_cam: Array | None) -> State:
         """At rest, before any motion, with the frame at ``t_ns`` as reference."""
-        felt = None if T_imu_cam is None else Felt(se3.inverse(T_imu_cam))
-        return cls(t_ns, t_ns, t_ns, np.eye(4), np.zeros(6), 0.0, points, leaps=Leaps(t_ns), felt=felt)
+        state = cls(t_ns, t_ns, t_ns, np.eye(4), np.zeros(6), 0.0, points, leaps=Leaps(t_ns))
+        if T_imu_cam is not None:
+            state.place_imu(T_imu_cam)
+        return state
+
+    def place_imu(self, T_imu_cam: Array) -> None:
+        """The camera sits there (4, 4) on the IMU, which has yet to prove itself."""
+        self.felt = Felt(se3.inverse(T_imu_cam))
 
     def feel(self, t_ns: int, imu: ImuMoments) -> None:
         """Carry velocities on to the frame at ``t_ns``, over a step with these moments of the IMU."""

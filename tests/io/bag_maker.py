@@ -68,12 +68,14 @@ class BagMaker:
         )  # fmt: skip
         self.add(topic, message, t_ns)
 
-    def imu(self, topic: str, t_ns: int, gyro=(0.1, 0.2, 0.3), acc=(0.0, 0.0, 9.81), *, known=(0.0, 0.0)) -> None:
+    def imu(
+        self, topic: str, t_ns: int, gyro=(0.1, 0.2, 0.3), acc=(0.0, 0.0, 9.81), *, known=(0.0, 0.0), frame="cam"
+    ) -> None:
         """``known``: what the covariances of rate and acceleration begin with, -1 for none."""
         v = self.type("geometry_msgs/msg/Vector3")
         q = self.type("geometry_msgs/msg/Quaternion")
         message = self.type("sensor_msgs/msg/Imu")(
-            header=self.header(t_ns), orientation=q(0, 0, 0, 1), orientation_covariance=np.zeros(9),
+            header=self.header(t_ns, frame), orientation=q(0, 0, 0, 1), orientation_covariance=np.zeros(9),
             angular_velocity=v(*gyro), angular_velocity_covariance=np.array([known[0], *[0.0] * 8]),
             linear_acceleration=v(*acc), linear_acceleration_covariance=np.array([known[1], *[0.0] * 8]),
         )  # fmt: skip
@@ -88,6 +90,13 @@ class BagMaker:
         body = self.type("geometry_msgs/msg/Transform")(self.type("geometry_msgs/msg/Vector3")(*p), q)
         message = self.type("geometry_msgs/msg/TransformStamped")(self.header(t_ns, parent), child, body)
         self.add(topic, message, t_ns)
+
+    def tf(self, topic: str, t_ns: int, *transforms: tuple[np.ndarray, str, str]) -> None:
+        """One message of transforms: each (4, 4), its parent and its child."""
+        parts = BagMaker(self.ros1)
+        for T, parent, child in transforms:
+            parts.transform("/", 0, T, parent, child)
+        self.add(topic, self.type("tf2_msgs/msg/TFMessage")([m for _, _, m in parts.messages]), t_ns)
 
     def pose_with_covariance(self, topic: str, t_ns: int, T: np.ndarray, cov: np.ndarray, frame: str = "odom") -> None:
         p, q = self._pose(T)

@@ -52,11 +52,7 @@ def _placed(tmp_path, *topics):
     """A bag whose transforms, one message for each topic, place its camera on base_link by (4, 4) each."""
     maker = stereo_bag(False)
     for k, (topic, T) in enumerate(topics):
-        parts = BagMaker(False)
-        parts.transform("/", 0, T, "base_link", "head")
-        parts.transform("/", 0, PLACE, "head", "cam")
-        t_ns = seq.stamps(12)[k]
-        maker.add(topic, maker.type("tf2_msgs/msg/TFMessage")([m for _, _, m in parts.messages]), t_ns)
+        maker.tf(topic, seq.stamps(12)[k], (T, "base_link", "head"), (PLACE, "head", "cam"))
     return maker.write(tmp_path / f"{len(topics)}")
 
 
@@ -93,6 +89,31 @@ def test_transforms_that_nobody_asked_for_refuse_no_bag(tmp_path):
 def test_the_frame_of_the_images_is_no_body(tmp_path):
     with pytest.raises(SourceError, match="'cam' is the frame of the left images"):
         open_source(_placed(tmp_path, ("/tf_static", TILTED)), base_frame="cam")
+
+
+def _with_imu(tmp_path, frame, *places):
+    """A bag whose IMU names its frame, and whose transforms place ``imu_link`` on base_link by (4, 4) each."""
+    maker = stereo_bag(False)
+    maker.messages = [m for m in maker.messages if m[1] != "/imu0"]
+    for k, T in enumerate(places):
+        t_ns = seq.stamps(12)[k]
+        maker.tf("/tf_static", t_ns, (T, "base_link", "imu_link"), (PLACE, "base_link", "cam"))
+        maker.imu("/imu0", t_ns, frame=frame)
+    return maker.write(tmp_path / f"{frame.strip('/')}{len(places)}")
+
+
+def test_an_imu_of_which_no_calibration_says_where_it_sits_is_placed_by_static_transforms(tmp_path):
+    source = open_source(_with_imu(tmp_path, "/imu_link", TILTED, TILTED))
+    np.testing.assert_allclose(source.mounting.T_imu_cam, se3.inverse(TILTED) @ PLACE, atol=1e-12)
+    assert "taken from /tf_static ('imu_link' to 'cam')" in " ".join(source.report.notes)
+    chain = tmp_path / "of_both.yaml"
+    chain.write_text(seq.camchain_yaml().replace("cam1:", f"  T_cam_imu: {se3.inverse(PLACE).tolist()}\ncam1:"))
+    calibrated = open_source(source.path, calibration=chain)
+    np.testing.assert_allclose(calibrated.mounting.T_imu_cam, PLACE, atol=1e-12)
+    for frame, places in (("cam", [TILTED]), ("gyro", [TILTED]), ("imu_link", [TILTED, TILTED @ TILTED, TILTED])):
+        unplaced = open_source(_with_imu(tmp_path, frame, *places))
+        assert unplaced.mounting.T_imu_cam is None
+        assert ("it changes" in " ".join(unplaced.report.notes)) == (len(places) == 3)
 
 
 def test_single_storage_files(tmp_path):

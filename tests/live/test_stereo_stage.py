@@ -96,6 +96,30 @@ def test_what_a_run_reads_is_read_live(which: str, tmp_path: Path) -> None:
     assert not stage.problems()
 
 
+@pytest.mark.parametrize("when", ["first", "late"])
+def test_an_imu_is_placed_by_static_transforms_as_in_a_bag(when: str, tmp_path: Path) -> None:
+    maker, T = stereo_bag(ros1=False, n=8), se3.exp(np.array([0.1, 0.0, -0.05, -1.2, 1.2, -1.1]))
+    maker.messages = [m for m in maker.messages if m[1] != "/imu0"]
+    for t in seq.stamps(8):
+        maker.imu("/imu0", t, frame="imu")
+    maker.tf("/tf_static", seq.stamps(8)[4 if when == "late" else 0] - 1, (T, "imu", "cam"))
+    bag = maker.write(tmp_path / "bag")
+    source = open_source(bag, prefetch=False)
+    theirs = [s.record for s in runner.steps(source, make_config())]
+    stage = StereoStage(LEFT, RIGHT, "/imu0")
+    settings = LiveSettings(tmp_path, stereo=(LEFT, RIGHT), imu="/imu0", replay=bag)
+    assert {"/tf_static", "/imu0"} <= set(topics_in(stage, settings))
+    arrivals = list(replay(bag, _present(bag, topics_in(stage, settings)), threading.Event(), fast=True))
+    taken = [t for a in arrivals for t in stage.take(a)]
+    taken += stage.flush()
+    assert stage._odometry is not None
+    np.testing.assert_allclose(stage._odometry._T_imu_cam, T, atol=1e-12)
+    assert not stage.wants_place
+    if when == "first":
+        _equal([t.record for t in taken], theirs)
+    assert stage._odometry._state.felt is not None
+
+
 @pytest.mark.parametrize("which", ["apart", "gyroscope alone", "whole"])
 def test_gyroscope_and_accelerometer_apart_are_joined_as_in_a_bag(which: str, tmp_path: Path) -> None:
     maker = stereo_bag(ros1=False, n=28)
