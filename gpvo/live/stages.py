@@ -34,6 +34,9 @@ from gpvo.types import IMPORTED, IMPORTED_POSE, Array, Status, StereoCamera, VoR
 
 _MAX_M, _MAX_MPS, _MAX_RADPS = 1e7, 300.0, 50.0
 _ENOUGH, _GROWS = 20, 0.95
+_RECENT, _FEW = 50, 0.1  # messages that troubles are looked for in, and the share of them that is none
+_IMPOSSIBLE = "impossible speed"
+_FAST = "are reached at impossible speeds: does something else publish there, too, or are they not in metres?"
 
 
 @dataclass(frozen=True)
@@ -117,6 +120,7 @@ class PoseStage:
         self._last: tuple[int, Array, Array | None] | None = None  # stamp, T_parent_cam, covariance of the pose
         self._is_unknown = False
         self._growth: deque[bool] = deque(maxlen=200)
+        self._troubles: deque[str] = deque(maxlen=_RECENT)  # of the last messages, empty for none
         self._moved, self._motions = np.zeros(6), 0  # sum of the squared motions of the body by axis, and their count
 
     def take(self, arrival: Arrival) -> Iterator[Taken]:
@@ -134,6 +138,8 @@ class PoseStage:
             self._last = None
         else:
             self.counts["other_frames"] += 1
+            told = printable(" to ".join(filter(None, frames)))
+            self._troubles.append(f"are between other frames ({told}): does something else publish there, too?")
             return
         if frames != self._frames and not self._is_fixed:
             self._place(np.eye(4) if is_optical(moving_frame(message)) else T_FLU_OPTICAL)
@@ -147,6 +153,7 @@ class PoseStage:
             self._last = None
         begins = self._last is None
         record = self._record(t_ns, T_parent_body @ self.T_body_cam, message, seen)
+        self._troubles.append(_FAST if record.reason == _IMPOSSIBLE else "")
         parent, child = frames
         if not child and is_optical(parent):  # a pose message's one name is that of what moves
             parent, child = child, parent
@@ -157,8 +164,12 @@ class PoseStage:
         return iter(())
 
     def problems(self) -> list[str]:
-        """None: a pose needs nothing else."""
-        return []
+        """Many messages of late between other frames, or too far from one to the next."""
+        found = Counter(filter(None, self._troubles)).most_common(1)
+        if not found or found[0][1] <= _FEW * _RECENT:
+            return []
+        (what, count), last = found[0], len(self._troubles)
+        return [f"{count} of the last {last} poses on '{self.topic}' {what}"]
 
     def _record(self, t_ns: int, T_parent_cam: Array, message: Any, seen: Sequence) -> VoRecord:
         before, pose = self._last, stated_covariance(getattr(message, "pose", None))
@@ -179,7 +190,7 @@ class PoseStage:
         if seen is Sequence.GAP:
             status, reason = Status.LOST, "gap in the log"
         elif rate[:3].max() > _MAX_MPS or rate[3:].max() > _MAX_RADPS:
-            status, reason = Status.LOST, "impossible speed"
+            status, reason = Status.LOST, _IMPOSSIBLE
             self.counts["jumps"] += 1
         elif self._is_unknown or was_unknown:
             status, reason = Status.LOST, "stated as unknown"

@@ -319,6 +319,21 @@ def test_two_publishers_on_one_topic_are_not_mixed_and_other_frames_for_good_are
     assert {(o.frame_id, o.child_frame_id) for o in kept.frames[50:]} == {("map", "imu")}
 
 
+@pytest.mark.parametrize("frames", [("map", "lidar"), ("odom", "base_link")])
+def test_a_second_publisher_is_asked_about_while_it_publishes(
+    frames: tuple[str, str], recording: list[Arrival]
+) -> None:
+    live, _, told = engine()
+    for k, arrival in enumerate(recording):
+        live.take(arrival)
+        if 5 <= k < 40:
+            far = _placed(_in_frames(_moved(arrival, 1e-3), *frames), se3.exp(np.full(6, 20.0)))
+            live.take(far)
+        if k in (4, 39, len(recording) - 1):
+            assert any("something else publish" in text for text in live.stage.problems()) == (k == 39)
+    assert any(TOPIC in text and "something else publish" in text for text in told)
+
+
 def test_a_child_frame_that_becomes_an_optical_one_has_its_axes(recording: list[Arrival]) -> None:
     """The same path, told of the body and later of the camera on it."""
     live, kept, _ = engine()
