@@ -115,7 +115,7 @@ def import_log(
         VoLog(records),
         overwrite=overwrite,
         truth=given,
-        mounting=Mounting(T_body_cam=None if frame == "cam" else T_FLU_OPTICAL),
+        mounting=_mounting(log, frame),
         config={"import": {"frame": frame, "align": align, "time_offset_s": time_offset_s}},
         meta=meta | {"notes": notes, "vehicle": asdict(vehicle or Vehicle())},
     )
@@ -174,6 +174,13 @@ def _summary(
     known = 0 if truth is None else int(interpolate_truth(truth, log.t_ns)[1].sum())
     fit = () if fixed is None else (fixed.angle_deg, fixed.lever_m, fixed.worlds_deg)
     return ImportSummary(len(log), list(log.methods), known, offset_s, notes, *fit)
+
+
+def _mounting(log: ForeignLog, frame: str) -> Mounting:
+    """Of a body, at its origin. The frame that a bag names has its axes only where they were read as they are."""
+    if frame == "cam":
+        return Mounting()
+    return Mounting(T_FLU_OPTICAL, body=log.body) if frame == "body" else Mounting(T_FLU_OPTICAL)
 
 
 def _frame(log: ForeignLog) -> str:

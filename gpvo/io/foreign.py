@@ -11,12 +11,12 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from gpvo.errors import SourceError, counted
+from gpvo.errors import SourceError, counted, printable
 from gpvo.geometry import covariance as transport
 from gpvo.geometry import se3
 from gpvo.geometry.covariance import variances
 from gpvo.geometry.se3 import T_FLU_OPTICAL
-from gpvo.io.bag_messages import covariances_of, read_poses
+from gpvo.io.bag_messages import covariances_of, frame_name, read_poses
 from gpvo.io.bag_reader import ODOMETRY_TYPE, POSE_TYPES, is_bag, open_bag, topics_of
 from gpvo.io.foreign_csv import POSITIONS_ALONE, Table, column_names, is_tum, read_table
 from gpvo.io.stamps import check_interval, is_number, text_lines
@@ -62,7 +62,8 @@ class ForeignLog:
 
     ``covariance`` (N, 6, 6) or None: NaN where unknown, house order, axes of the moving frame. ``covariance_of``:
     ``"motion"`` from the row before, ``"pose"`` since the start. ``columns``: further fields of the records, (N,).
-    ``topic``: of a bag, and ``frame_id`` the name that its messages give to the frame whose poses they hold.
+    ``topic``: of a bag, and ``frame_id`` the name that its messages give to the frame whose poses they hold;
+    ``body``: the same where it is a body's and not the world's, else ``base_link``.
     ``is_counted``: its stamps are its rows' numbers at a rate that was given, so that another log's rows must be the
     same. ``other_topics``: of a bag, those with poses that were not read.
     """
@@ -75,6 +76,7 @@ class ForeignLog:
     notes: tuple[str, ...] = ()
     topic: str | None = None
     frame_id: str | None = None
+    body: str = "base_link"
     is_counted: bool = False
     other_topics: tuple[str, ...] = ()
 
@@ -352,7 +354,10 @@ def _read_bag(path: Path, topic: str | None, axes: str, complete: bool) -> Forei
 def _read_bag_topic(path: Path, topic: str, axes: str, complete: bool) -> ForeignLog:
     notes: list[str] = []
     t, T, read = read_poses(path, topic, notes.append, complete=complete)
-    log = ForeignLog(path, Trajectory(t, T), notes=tuple(notes), topic=topic, frame_id=moving_frame(read[0]))
+    frame, child = moving_frame(read[0]), frame_name(getattr(read[0], "child_frame_id", ""))
+    log = ForeignLog(path, Trajectory(t, T), notes=tuple(notes), topic=topic, frame_id=frame)
+    if child and not is_optical(child):
+        log = replace(log, body=printable(child[:256]))
     stated = (covariances_of(read, name) for name in ("twist", "pose"))
     twist, pose = (None if C is None else np.where(np.isfinite(C), C, np.nan) for C in stated)
     still = still_axes(T)

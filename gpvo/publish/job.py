@@ -25,7 +25,8 @@ TARGETS = ("bag", "mcap", "mavlink")
 _PARAMETERS = (b"^# robot_localization fed by gpvo", "file of parameters")
 _UNPLACED = (
     "base_link here is the left camera, x ahead: the run does not know where it sits on a body (gpvo run BAG "
-    "--base-frame NAME); the filter must be told, or the camera look straight ahead"
+    "--base-frame NAME; of a log of a body's poses, gpvo import --frame body); the filter must be told, or the camera "
+    "look straight ahead"
 )
 _SUFFIXES = {".bag": "bag", ".mcap": "mcap", ".tlog": "mavlink"}
 
@@ -34,7 +35,8 @@ _SUFFIXES = {".bag": "bag", ".mcap": "mcap", ".tlog": "mavlink"}
 class Published:
     """What was written, and what the consumer will make of it. ``outside``: frames with a motion that are marked by a
     MAVLink quality of -1 as far outside the model's domain; ArduPilot refuses them. ``is_placed``: whether the run
-    knows where the camera sits on the body; if not, ``base_link`` is the left camera, x ahead."""
+    knows where the camera sits on the ``body``, as messages call it; if not, it is the left camera, x ahead.
+    ``of_poses``: whether it is that of poses that were imported."""
 
     run: str
     to: str | None
@@ -45,6 +47,8 @@ class Published:
     source: str
     consumer: str | None
     is_placed: bool
+    body: str
+    of_poses: bool
     verdicts: Sequence[consumers.Verdict]
 
     def document(self) -> dict[str, Any]:
@@ -59,6 +63,8 @@ class Published:
             head += f", {self.outside} far outside the model's domain (MAVLink quality -1: ArduPilot refuses them)"
         if not self.is_placed:
             head += f"\n{_UNPLACED}"
+        elif self.of_poses:
+            head += f"\n{self.body} here is the body whose poses were imported"
         return "\n".join([head, *(f"{self.consumer} {v}" for v in self.verdicts)])
 
 
@@ -87,8 +93,8 @@ def publish_run(path: Path, settings: PublishSettings) -> Published:
     lost = sum(not o.tracked for o in odometry)
     outside = sum(mavlink.quality(o) < 0 for o in odometry) - lost
     asked = consumer if settings.check else None
-    placed = run.mounting.T_body_cam is not None
-    return Published(run.name, settings.to, out, count, lost, outside, source, asked, placed, verdicts)
+    placed, body, of_poses = run.mounting.T_body_cam is not None, run.mounting.body, run.log.camera is None
+    return Published(run.name, settings.to, out, count, lost, outside, source, asked, placed, body, of_poses, verdicts)
 
 
 def odometry_of(run: Run, predictions: Mapping[int, Prediction], settings: PublishSettings) -> list[Odometry]:

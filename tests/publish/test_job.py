@@ -7,7 +7,9 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from bag_maker import BagMaker
 from gpvo.cli import app
+from gpvo.cli.files import import_log
 from gpvo.dataset.build import predictions_of
 from gpvo.errors import GpvoError, ModelError
 from gpvo.geometry import se3
@@ -19,7 +21,7 @@ from gpvo.online.predictor import Predictor
 from gpvo.publish import PublishSettings
 from gpvo.publish.export import export_model
 from gpvo.publish.job import odometry_of, publish_run
-from gpvo.types import Mounting, Prediction, Status, VoLog
+from gpvo.types import IMPORTED, Mounting, Prediction, Status, VoLog
 from small_model import small_model
 from synthetic_runs import make_run
 from typer.testing import CliRunner
@@ -63,6 +65,19 @@ def test_messages_name_the_body_that_they_are_of_and_a_run_without_one_is_told(p
     T = written.trajectory.T_world_body
     k = written.t_ns.tolist().index(record.t_ns)
     np.testing.assert_allclose(se3.inverse(T[k - 1]) @ T[k], motion, atol=1e-9)
+
+
+def test_imported_poses_keep_the_name_of_their_frame_where_their_axes_are_its_own(tmp_path: Path) -> None:
+    maker = BagMaker(ros1=False)
+    for k in range(20):
+        T = se3.exp(np.array([0.1 * k, 0.0, 0.0, 0.0, 0.0, 0.01 * k]))
+        maker.odometry("/odom", k * 10**8, T, np.eye(6) * 1e-4 * (k + 1), np.eye(6) * 1e-4, child="/imu_link")
+    log = read_foreign(maker.write(tmp_path / "log"))
+    for frame, name in (("auto", "imu_link"), ("body", "imu_link"), ("frd", "base_link"), ("cam", "base_link")):
+        import_log(log, None, tmp_path / frame, frame=frame)
+        told = publish_run(tmp_path / frame, PublishSettings(method=IMPORTED, out=tmp_path / f"{frame}.mcap"))
+        assert read_foreign(tmp_path / f"{frame}.mcap").frame_id == told.body == name
+        assert (f"{name} here is the body whose poses were imported" in str(told)) == (frame != "cam")
 
 
 def test_a_consumer_that_nothing_would_read_is_refused(predicted: Path, tmp_path: Path) -> None:
