@@ -208,6 +208,7 @@ class StereoStage:
         if T_imu_camera is not None and self._imu_frame != camera:  # one name for both, as some drivers have it
             self._T_imu_cam = T_imu_camera @ self.T_source_cam
             odometry.place_imu(self._T_imu_cam)
+            self.counts["imu_placed"] += 1
 
     def _restart(self) -> None:
         self._odometry, self._t_last_ns = None, 0

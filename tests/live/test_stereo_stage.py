@@ -115,6 +115,7 @@ def test_an_imu_is_placed_by_static_transforms_as_in_a_bag(when: str, tmp_path: 
     assert stage._odometry is not None
     np.testing.assert_allclose(stage._odometry._T_imu_cam, T, atol=1e-12)
     assert not stage.wants_place
+    assert stage.counts["imu_placed"] == 1
     if when == "first":
         _equal([t.record for t in taken], theirs)
     assert stage._odometry._state.felt is not None
