@@ -69,8 +69,9 @@ class Output(Protocol):
 class Engine:
     """Steps stage, predictor and message builder, and hands the results to the outputs.
 
-    The pose that is published never jumps: where the source starts again, or was away, an unknown motion stands
-    between, with the covariance of what may have happened. ``truth`` adapts the predictor's scale.
+    The pose that is published does not jump where the source starts again or was away for long: an unknown motion
+    stands between, with the covariance of what may have happened. Over a gap it follows the source, as uncertain.
+    ``truth`` adapts the predictor's scale.
     ``tell``: called with each warning, at once and then every 10 s while it holds. ``topics``: those that should come.
     ``increment``: the pose's covariance is that of its last motion, not accumulated since the start. ``state``: file
     that holds where the odometry stood and what late truth taught; taken up at the start, written every 10 s and at the
