@@ -25,18 +25,15 @@ CAMERA_HEIGHT_M = 1.6  # over the road
 
 @dataclass(frozen=True)
 class Episode:
-    """From ``begin_s`` to ``end_s``. The factors say what the cause does to pixel noise, number of tracks and outliers
-    where no images are drawn: together they raise the standard deviation of VO's error about tenfold."""
+    """From ``begin_s`` to ``end_s``, by a ``cause``."""
 
     begin_s: float
     end_s: float
     cause: str
-    sigma_factor: float = 1.0
-    count_factor: float = 1.0
-    outlier_factor: float = 1.0
 
 
-# Factors on (pixel noise, number of tracks, outliers): error grows with noise and with the root of the number.
+# Factors on (pixel noise, number of tracks, outliers) where no images are drawn: error grows with noise and with the
+# root of the number, and its standard deviation about tenfold.
 CAUSES: dict[str, tuple[float, float, float]] = {
     "darkness": (2.8, 0.22, 3.0),
     "dust": (2.6, 0.20, 4.0),
@@ -66,7 +63,7 @@ def draw_episodes(
     for gap, length in zip(gaps[:-1], lengths, strict=True):
         cause = str(rng.choice(list(causes)))
         t += gap
-        out.append(Episode(t, t + length, cause, *CAUSES[cause]))
+        out.append(Episode(t, t + length, cause))
         t += length + 0.5
     return tuple(out)
 

@@ -159,30 +159,29 @@ def observe(
             active[:] = False
             out.append((np.empty(0, np.int64), np.empty((0, 2)), np.empty((0, 2))))
             continue
-        bad = next((e for e in episodes if e.begin_s <= t < e.end_s), None)
+        cause = next((e.cause for e in episodes if e.begin_s <= t < e.end_s), None)
+        noisier, fewer, wronger = events.CAUSES[cause] if cause else (1.0, 1.0, 1.0)
         points = np.concatenate([cloud, *(b.at(k, streams[6]) for b in bodies)]) if bodies else cloud
         left, right, visible, depth = _visible(rig, T_world_cam[k], points, _of_frame(scenario.reach_m, k))
         if bodies:
             visible &= ~events.hidden(bodies, len(cloud), left, depth)
-        wanted = int(_of_frame(scenario.tracks, k) * (bad.count_factor if bad else 1.0))
+        wanted = int(_of_frame(scenario.tracks, k) * fewer)
         before = active.copy()
-        drop = min(1.0, _of_frame(scenario.drop, k) * (3.0 if bad else 1.0))
+        drop = min(1.0, _of_frame(scenario.drop, k) * (3.0 if cause else 1.0))
         _renew(active, generation, visible, wanted, drop, life)
         i = np.flatnonzero(active)
         moved_px, apart_px = kept.follow(k, i, np.flatnonzero(active & ~before))
         flow = np.hypot(*(left[i] - last_uv[i]).T)
         last_uv[:] = np.nan
         last_uv[i] = left[i]
-        sigma = quality * (_of_frame(scenario.sigma_px, k) + scenario.blur_px * np.nan_to_num(flow))
-        if bad:
-            sigma = sigma * bad.sigma_factor
+        sigma = quality * (_of_frame(scenario.sigma_px, k) + scenario.blur_px * np.nan_to_num(flow)) * noisier
         if scenario.noise_every and k % scenario.noise_every == 0:
             sigma = np.hypot(sigma, scenario.noise_px)
         n = len(i)
         uv_left = left[i] + moved_px + sigma[:, None] * noise.standard_normal((n, 2))
         uv_right = right[i] + moved_px + sigma[:, None] * noise.standard_normal((n, 2))
         uv_right[:, 0] -= apart_px
-        wrong = noise.random(n) < _of_frame(scenario.outliers, k) * (bad.outlier_factor if bad else 1.0)
+        wrong = noise.random(n) < _of_frame(scenario.outliers, k) * wronger
         jump = noise.uniform(-25, 25, (n, 2)) * wrong[:, None]
         out.append((i + generation[i] * total, uv_left + jump, uv_right + jump))
     return out
