@@ -165,13 +165,12 @@ class TriangleDistance:
             found.append(members[tree.query(points, k=count)[1].reshape(len(points), count)])
         index = np.concatenate(found, axis=1)
         a, b, c = np.moveaxis(self._corners[index], 2, 0)
-        nearest = _closest_on_triangles(points[:, None], a, b, c)
-        offset = points[:, None] - nearest
-        distance = np.linalg.norm(offset, axis=-1)
         normal = np.cross(b - a, c - a)
         normal /= np.maximum(np.linalg.norm(normal, axis=-1, keepdims=True), 1e-30)
+        offset = _offsets(points[:, None], a, b, c, normal)
+        distance = np.linalg.norm(offset, axis=-1)
         # Several triangles share an edge or a corner: the one seen most squarely says which side it is.
-        side = (offset * normal).sum(axis=-1)
+        side = _dot(offset, normal)
         best = distance.min(axis=1, keepdims=True)
         side = np.where(distance <= best + 1e-9 + 1e-6 * best, side, 0.0)
         winner = np.abs(side).argmax(axis=1)
@@ -179,32 +178,20 @@ class TriangleDistance:
         return sign * best[:, 0]
 
 
-def _closest_on_triangles(p: Array, a: Array, b: Array, c: Array) -> Array:
-    """Nearest point of triangles ``a b c`` to ``p``, all (..., 3): C. Ericson, "Real-Time Collision Detection" (2005),
-    section 5.1.5."""
-    ab, ac, ap, bp, cp = b - a, c - a, p - a, p - b, p - c
-    d1, d2 = (ab * ap).sum(-1), (ac * ap).sum(-1)
-    d3, d4 = (ab * bp).sum(-1), (ac * bp).sum(-1)
-    d5, d6 = (ab * cp).sum(-1), (ac * cp).sum(-1)
-    va, vb, vc = d3 * d6 - d5 * d4, d5 * d2 - d1 * d6, d1 * d4 - d3 * d2
+def _offsets(p: Array, a: Array, b: Array, c: Array, normal: Array) -> Array:
+    """From the nearest point of triangles ``a b c`` to ``p``, all (..., 3): it lies below, or else on an edge."""
+    above, nearest, least = np.ones(a.shape[:-1], bool), np.zeros_like(a), np.full(a.shape[:-1], np.inf)
+    for start, end in ((a, b), (b, c), (c, a)):
+        along, off = end - start, p - start
+        above &= _dot(np.cross(normal, along), off) > 0  # of a triangle without area, never
+        off -= np.clip(_dot(off, along) / np.maximum(_dot(along, along), 1e-300), 0, 1)[..., None] * along
+        square = _dot(off, off)
+        nearest, least = np.where((square < least)[..., None], off, nearest), np.minimum(square, least)
+    return np.where(above[..., None], _dot(p - a, normal)[..., None] * normal, nearest)
 
-    def ratio(x: Array, y: Array) -> Array:
-        return x / np.where(np.abs(y) > 1e-300, y, 1e-300)
 
-    total = ratio(np.ones_like(va), va + vb + vc)
-    v, w = vb * total, vc * total
-    rules = (
-        ((va <= 0) & (d4 - d3 >= 0) & (d5 - d6 >= 0), 1 - ratio(d4 - d3, d4 - d3 + d5 - d6), None),
-        ((vb <= 0) & (d2 >= 0) & (d6 <= 0), 0.0, ratio(d2, d2 - d6)),
-        ((d6 >= 0) & (d5 <= d6), 0.0, 1.0),
-        ((vc <= 0) & (d1 >= 0) & (d3 <= 0), ratio(d1, d1 - d3), 0.0),
-        ((d3 >= 0) & (d4 <= d3), 1.0, 0.0),
-        ((d1 <= 0) & (d2 <= 0), 0.0, 0.0),
-    )
-    for where, new_v, new_w in rules:
-        v = np.where(where, new_v, v)
-        w = np.where(where, 1 - v if new_w is None else new_w, w)
-    return a + v[..., None] * ab + w[..., None] * ac
+def _dot(x: Array, y: Array) -> Array:
+    return np.asarray(np.einsum("...i,...i", x, y))
 
 
 def build_world(kind: str, seed: int, **params: object) -> World:
