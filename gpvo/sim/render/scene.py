@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from gpvo.cameras.models import CameraModel, PinholeRadtan
+from gpvo.cameras.models import CameraModel, KannalaBrandt, PinholeRadtan
 from gpvo.errors import GpvoError
 from gpvo.sim.worlds import LightMap, Mesh, World
 from gpvo.types import Array
@@ -203,12 +203,7 @@ def _pixel_plane(model: CameraModel, reach: NDArray[np.float32]) -> NDArray[np.f
 
 def _largest_angle(model: CameraModel) -> float:
     """Angle up to which the model projects every direction."""
-    theta = np.linspace(0.0, np.pi * 0.95, 400)
-    azimuth = np.linspace(0, 2 * np.pi, 16, endpoint=False)
-    t, a = np.meshgrid(theta, azimuth, indexing="ij")
-    points = np.stack([np.sin(t) * np.cos(a), np.sin(t) * np.sin(a), np.cos(t)], axis=-1).reshape(-1, 3)
-    uv, valid = model.project(points)
-    good = (valid & np.isfinite(uv).all(axis=1)).reshape(t.shape).all(axis=1)
-    last = len(theta) - 1 if good.all() else int(np.argmin(good)) - 1
-    limit = _PINHOLE_LIMIT_RAD if isinstance(model, PinholeRadtan) else np.pi
-    return min(float(theta[max(last - 1, 1)]), limit)
+    if isinstance(model, KannalaBrandt):
+        return model.max_angle_rad
+    assert isinstance(model, PinholeRadtan)
+    return min(float(np.arctan(model.max_radius)), _PINHOLE_LIMIT_RAD)
