@@ -12,6 +12,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
@@ -43,6 +44,12 @@ class Observations:
     uvd: Array
     trusted: NDArray[np.bool_]
 
+    @cached_property
+    def own_view(self) -> NDArray[np.int64]:
+        """The view (N,) in whose (u, v, d) each landmark moves: its nearest trusted one."""
+        order = np.lexsort((-self.uvd[:, 2], ~self.trusted, self.track))
+        return order[np.unique(self.track[order], return_index=True)[1]]
+
     def parts(self) -> Iterator[tuple[slice, Observations]]:
         """A hundred thousand at a time: matrices of each observation would need a gigabyte for a million."""
         for i in range(0, len(self.frame), _PART):
@@ -52,30 +59,16 @@ class Observations:
 
 
 @dataclass(frozen=True)
-class Chart:
-    """The view (N,) in whose (u, v, d) each landmark moves: its nearest trusted one."""
-
-    view: NDArray[np.int64]
-
-    @classmethod
-    def of(cls, seen: Observations) -> Chart:
-        """The chart of all landmarks that are seen."""
-        order = np.lexsort((-seen.uvd[:, 2], ~seen.trusted, seen.track))
-        first = np.unique(seen.track[order], return_index=True)[1]
-        return cls(order[first])
-
-    def begin(self, seen: Observations, T_world_cam: Array) -> Array:
-        """Landmarks (N, 3) as triangulated in that view."""
-        T = T_world_cam[seen.frame[self.view]]
-        return transform(T, triangulate(no_farther_than(seen.uvd[self.view], _MIN_DISPARITY_PX), seen.camera))
-
-
-@dataclass(frozen=True)
 class Estimate:
     """Poses ``T_world_cam`` (F, 4, 4) and landmarks ``points_world`` (N, 3) [m]."""
 
     T_world_cam: Array
     points_world: Array
+
+    @classmethod
+    def begin(cls, seen: Observations, T_world_cam: Array) -> Estimate:
+        """Landmarks as triangulated in their own views."""
+        return cls(T_world_cam, _triangulated(seen.uvd[seen.own_view], seen, T_world_cam))
 
     def in_camera(self, seen: Observations) -> Array:
         """(M, 3) each observation's landmark in its camera, never behind it."""
@@ -88,18 +81,23 @@ class Estimate:
         """(M, 3) what was measured, less the landmark projected."""
         return seen.uvd - seen.camera.project(self.in_camera(seen))
 
-    def uvd(self, chart: Chart, seen: Observations) -> Array:
+    def uvd(self, seen: Observations) -> Array:
         """(N, 3) the landmarks in their own views."""
-        T = se3.inverse(self.T_world_cam[seen.frame[chart.view]])
+        T = se3.inverse(self.T_world_cam[seen.frame[seen.own_view]])
         P = transform(T, self.points_world)
         P[:, 2] = np.maximum(P[:, 2], _least_depth_m(seen.camera))
         return seen.camera.project(P)
 
-    def moved(self, step_cam: Array, step_uvd: Array, chart: Chart, seen: Observations) -> Estimate:
+    def moved(self, step_cam: Array, step_uvd: Array, seen: Observations) -> Estimate:
         """After steps (F, 6) of the poses, on the right, and (N, 3) [px] of the landmarks."""
-        uvd = no_farther_than(self.uvd(chart, seen) + step_uvd, _MIN_DISPARITY_PX)
-        points = transform(self.T_world_cam[seen.frame[chart.view]], triangulate(uvd, seen.camera))
+        points = _triangulated(self.uvd(seen) + step_uvd, seen, self.T_world_cam)
         return Estimate(self.T_world_cam @ se3.exp(step_cam), points)
+
+
+def _triangulated(uvd: Array, seen: Observations, T_world_cam: Array) -> Array:
+    """Landmarks (N, 3) in the world from (u, v, d) in their own views."""
+    points = triangulate(no_farther_than(uvd, _MIN_DISPARITY_PX), seen.camera)
+    return transform(T_world_cam[seen.frame[seen.own_view]], points)
 
 
 def _least_depth_m(camera: StereoCamera) -> float:
@@ -171,14 +169,14 @@ class NormalEquations:
     point_gradient: Array  # (N, 3)
 
     @classmethod
-    def of(cls, seen: Observations, pieces: Pieces, now: Estimate, chart: Chart, root_weight: Array) -> NormalEquations:
+    def of(cls, seen: Observations, pieces: Pieces, now: Estimate, root_weight: Array) -> NormalEquations:
         """At an estimate; ``root_weight`` (M,) of the observations [1/px]."""
         n_frames, n_tracks = len(now.T_world_cam), len(now.points_world)
         B, C = np.zeros((n_frames, 6, 6)), np.zeros((len(pieces.track), 3, 3))
         by_pose, by_point = np.zeros((n_frames, 6)), np.zeros((n_tracks, 3))
         blocks = np.empty((len(seen.frame), 6, 3))
         R = now.T_world_cam[:, :3, :3]
-        lift = R[seen.frame[chart.view]] @ point_jacobian(now.uvd(chart, seen), seen.camera)
+        lift = R[seen.frame[seen.own_view]] @ point_jacobian(now.uvd(seen), seen.camera)
         for rows, part in seen.parts():
             P, root = now.in_camera(part), root_weight[rows]
             r = (root[:, None] * ((part.uvd - seen.camera.project(P)) @ WHITEN.T))[:, :, None]

@@ -24,7 +24,6 @@ from scipy.spatial import cKDTree
 from gpvo.geometry import se3
 from gpvo.twin.bundle import (
     WHITEN,
-    Chart,
     Estimate,
     NormalEquations,
     Observations,
@@ -61,8 +60,7 @@ def adjust(
     their frame are left out, and the rest weighted by Huber's rule. ``tolerance``: relative decrease of the cost
     [-] at which the fit ends.
     """
-    chart, pieces = Chart.of(seen), Pieces.of(seen)
-    now = Estimate(T_world_cam, chart.begin(seen, T_world_cam))
+    pieces, now = Pieces.of(seen), Estimate.begin(seen, T_world_cam)
     weight, sigma = seen.trusted.astype(np.float64), np.ones(len(T_world_cam))
     damping, converged = 1e-4, False
     for iteration in range(1, max_iterations + 1):
@@ -71,11 +69,11 @@ def adjust(
             weight, sigma = _robust_weights(seen, now, sigma)
         root = np.sqrt(weight) / sigma[seen.frame]
         normal = None  # frees the last one before the next is made
-        normal = NormalEquations.of(seen, pieces, now, chart, root)
+        normal = NormalEquations.of(seen, pieces, now, root)
         cost = _cost(seen, now, root)
         for _ in range(8):
             step_cam, step_uvd = normal.solve(damping)
-            candidate = now.moved(step_cam, step_uvd, chart, seen)
+            candidate = now.moved(step_cam, step_uvd, seen)
             after = _cost(seen, candidate, root)
             if after <= cost:
                 break

@@ -5,7 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from gpvo.geometry import se3
-from gpvo.twin.bundle import REACH, WHITEN, Chart, Estimate, NormalEquations, Observations, Pieces, damped
+from gpvo.twin.bundle import REACH, WHITEN, Estimate, NormalEquations, Observations, Pieces, damped
 from gpvo.twin.noise import adjust, without_loose_frames
 from gpvo.types import StereoCamera
 from scipy.linalg import block_diag
@@ -107,10 +107,10 @@ def test_a_frame_without_points_lies_between_its_neighbours():
 def test_steps_are_those_of_the_dense_equations(n_frames, error):
     rng = np.random.default_rng(6)
     T, _, seen = small_problem(rng, n_frames=n_frames, n_tracks=40)
-    chart, pieces = Chart.of(seen), Pieces.of(seen)
+    pieces = Pieces.of(seen)
     start = T @ se3.exp(0.01 * rng.standard_normal((n_frames, 6)))
-    now = Estimate(start, chart.begin(seen, start))
-    normal = NormalEquations.of(seen, pieces, now, chart, np.ones(len(seen.frame)))
+    now = Estimate.begin(seen, start)
+    normal = NormalEquations.of(seen, pieces, now, np.ones(len(seen.frame)))
     assert (len(pieces.track) > 40) == (n_frames > REACH)
     C = np.zeros((40, 3, 3))
     np.add.at(C, pieces.track, normal.C)
