@@ -66,7 +66,7 @@ def statements(
     ]
     kept = list(further)
     if "thesis.scale" in arrays and predictor is not None and predictor.target == "frame":
-        makers.append(cache(partial(_thesis, log, ThesisModel.of_file(arrays))))  # which takes a hundred times as long
+        makers.append(cache(partial(gp_statement, log, ThesisModel.of_file(arrays))))  # the others are quick
     if predictions and predictor is not None:
         makers.append(partial(predicted_statement, "base", log, predictor.base().replay(log)))
     if predictions:
@@ -94,11 +94,11 @@ def _frames_bridged(log: VoLog) -> Array:
     return 1.0 + np.where(log.usable, lost - lost[start], 0)
 
 
-def _thesis(log: VoLog, model: ThesisModel) -> Statement:
+def gp_statement(log: VoLog, model: ThesisModel) -> Statement:
+    """What a GP of the thesis says of the motions that were measured."""
     stream = FeatureStream(model.columns, log.camera)
     mean, covariance = model.predict(np.array([stream.step(r) for r in log]).reshape(-1, len(model.columns)))
     usable = log.usable[:, None]
-    # Of a motion that was not measured it knows nothing.
     stated = plain_statement(log, "gp_thesis", np.where(usable[:, None], covariance, np.nan))
     return replace(stated, mean=np.where(usable, mean, 0.0))
 

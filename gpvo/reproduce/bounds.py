@@ -14,15 +14,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from gpvo.accumulation import along
-from gpvo.dataset.build import build_run, observe, predictions_of
+from gpvo.dataset.build import observe, predictions_of
 from gpvo.dataset.errors import interpolate_truth
-from gpvo.evaluation.statements import corrected, plain_statement, predicted_statement
+from gpvo.evaluation.statements import Statement, corrected, gp_statement, plain_statement, predicted_statement
 from gpvo.files import write_arrays
 from gpvo.geometry import se3
 from gpvo.geometry.covariance import position_in_world, variances, where_stated
 from gpvo.io.run import Run, read_run
 from gpvo.learning.thesis import ThesisModel, fit_thesis
-from gpvo.online.features import THESIS
 from gpvo.online.predictor import Predictor
 from gpvo.reproduce.experiments import Experiment, Way, printed
 from gpvo.reproduce.models import ModelJob, sets_of
@@ -163,16 +162,19 @@ class BoundsJob:
         if kind == "v_t":
             return lambda run: (np.zeros((len(run.log), 3)), summed_v_t(run.log, name))
         if kind == "joint":
-            return lambda run: (np.zeros((len(run.log), 3)), _joint(run.log, where_stated(run.log.covariance(name))))
+            return lambda run: _of_motions(
+                run.log, plain_statement(run.log, name, where_stated(run.log.covariance(name)))
+            )
         if kind == "motion":
             gps = fit_thesis(sets_of(self.training))
-            return lambda run: _motion(run, gps)
+            return lambda run: _of_motions(run.log, gp_statement(run.log, gps))
         assert self.model is not None
         model = self.model.path(store)
         if kind == "position":
             positions = ThesisModel.of_positions(model)
             return lambda run: positions.predict(observe(run.log, positions.columns, "position")[1])
-        return lambda run: _learned(run, Predictor.load(model))
+        predictor = Predictor.load(model)
+        return lambda run: _of_motions(run.log, predicted_statement("learned", run.log, predictions_of(run, predictor)))
 
 
 def job_of(
@@ -190,25 +192,7 @@ def job_of(
     return BoundsJob(name, method, runs, training if method.kind == "motion" else (), model)
 
 
-def _joint(log: VoLog, covariance: Array) -> Array:
-    """(N, 3, 3) of positions from the covariances (N, 6, 6) of motions, NaN where nothing is said: as of the one before
-    it."""
-    errors = plain_statement(log, "", covariance).errors
-    assert errors is not None
-    return compounded(log, errors)
-
-
-def _motion(run: Run, model: ThesisModel) -> tuple[Array, Array]:
-    """A GP speaks of measured motions alone."""
-    s = build_run(run, columns=THESIS)
-    mean, covariance = np.zeros((len(run.log), 6)), np.full((len(run.log), 6, 6), np.nan)
-    rows = np.searchsorted(run.log.t_ns, s.t_ns)
-    mean[rows], covariance[rows] = model.predict(s.select(model.columns))
-    return mean_shift(run.log, mean), _joint(run.log, covariance)
-
-
-def _learned(run: Run, predictor: Predictor) -> tuple[Array, Array]:
-    """A model states no mean error."""
-    learned = predicted_statement("learned", run.log, predictions_of(run, predictor))
-    assert learned.errors is not None
-    return np.zeros((len(run.log), 3)), compounded(run.log, learned.errors)
+def _of_motions(log: VoLog, said: Statement) -> tuple[Array, Array]:
+    """Mean (N, 3) and covariance (N, 3, 3) of positions from what is said of motions."""
+    assert said.errors is not None
+    return mean_shift(log, said.mean), compounded(log, said.errors)
