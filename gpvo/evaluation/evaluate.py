@@ -147,7 +147,9 @@ def evaluate_run(
     something else than the error of a motion.
     """
     run, options = read_run(run), options or EvaluateOptions()
-    truth, offset_s = _truth(run, options)
+    fitted, offset_s = aligned(run, options.align, options.time_offset_s)
+    if (truth := fitted.truth) is None:
+        raise SourceError("has no ground truth", where=run.path, cure=NO_TRUTH)
     predictions, misfits = predictions_of(run, predictor), _misfits(run, predictor, misfits)
     run = replace(run, log=judged(run.log, predictions))
     log = run.log
@@ -273,13 +275,6 @@ def judged(log: VoLog, predictions: Mapping[int, Prediction]) -> VoLog:
     return log.judged_as(
         r if p is None or r.status is Status.START else r.with_status(p.status, BY_MODEL) for r, p in told
     )
-
-
-def _truth(run: Run, options: EvaluateOptions) -> tuple[TruthLog, float]:
-    run, offset_s = aligned(run, options.align, options.time_offset_s)
-    if run.truth is None:
-        raise SourceError("has no ground truth", where=run.path, cure=NO_TRUTH)
-    return run.truth, offset_s
 
 
 def distinct(names: Sequence[str]) -> list[str]:
