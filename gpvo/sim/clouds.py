@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
@@ -12,6 +12,7 @@ from gpvo.geometry import se3
 from gpvo.sim import paths, recorded
 from gpvo.sim.events import CAMERA_HEIGHT_M
 from gpvo.sim.paths import Path3
+from gpvo.sim.points_scenario import PointsScenario
 from gpvo.stats.series import interpolated
 from gpvo.types import Array
 
@@ -20,28 +21,25 @@ _STEP_M = 0.5  # between the points of a centre line
 _BEYOND_M = 80.0
 
 
-def make(
-    world: str, path: str, duration_s: float, speed_mps: float, rng: np.random.Generator, rest_s: float,
-    waypoints: Sequence[Sequence[float]] = (),
-) -> tuple[Path3, Array]:  # fmt: skip
-    """A path and the landmarks (N, 3) [m] around it.
-
-    ``path``: one of :data:`PATHS`, or a recorded one, a file or run folder, which is scaled to fit the world; a street
-    is laid along it. ``waypoints`` [m] are flown as they are.
-    """
+def make(chosen: PointsScenario, rng: np.random.Generator) -> tuple[Path3, Array]:
+    """A path and the landmarks (N, 3) [m] around it. A recorded path is scaled to fit the world, but a street is laid
+    along it; waypoints are flown as they are."""
+    world, path, duration_s, speed_mps, rest_s = (
+        chosen.world, chosen.path, chosen.duration_s, chosen.speed_mps, chosen.rest_s,
+    )  # fmt: skip
     if world not in _KINDS:
         raise GpvoError(f"unknown world '{world}'", cure=f"choose from {', '.join(_KINDS)}")
     reach = duration_s * speed_mps + 25.0
     bend = 0.0 if path == "straight" else 1.0
     centre = _tunnel_line(reach, rng, bend, scale=12.0 if world == "street" else 1.0)
     if world == "street" and path not in PATHS:
-        return _street_along(_recording(path, duration_s, rest_s), duration_s, rng, rest_s)
+        return _street_along(_recording(path, duration_s, rest_s), rng)
     landmarks, low, high = _KINDS[world]
     cloud = landmarks(centre, rng)
     if path == "hover":
         flown = paths.hover((low + high) / 2, 0.0, duration_s)
     elif path == "waypoints":
-        flown = paths.waypoints(np.array(waypoints), duration_s, speed_mps, rest_s)
+        flown = paths.waypoints(np.array(chosen.waypoints), duration_s, speed_mps, rest_s)
     elif path == "straight":
         height, ground = (1.1, ground_height) if world == "lunar" else (0.0, None)
         flown = paths.straight(
@@ -55,7 +53,7 @@ def make(
         line = centre * [1, 1, 0] + [0, 0, 1.5] if world == "lunar" else centre
         flown = paths.along_curve(line, duration_s, speed_mps, rng, sway_m=0.35, rest_s=rest_s)
     else:
-        flown = _recording(path, duration_s, rest_s).fitted(low, high, duration_s, rng, rest_s)
+        flown = _recording(path, duration_s, rest_s).fitted(low, high, rng)
     return flown, cloud
 
 
@@ -65,15 +63,13 @@ def _recording(path: str, duration_s: float, rest_s: float) -> recorded.Recordin
     return recorded.read_recording(Path(path), duration_s, rest_s)
 
 
-def _street_along(
-    recording: recorded.Recording, duration_s: float, rng: np.random.Generator, rest_s: float
-) -> tuple[Path3, Array]:
+def _street_along(recording: recorded.Recording, rng: np.random.Generator) -> tuple[Path3, Array]:
     """The recording as it is, and a street below it that goes on straight beyond both of its ends."""
-    path = recording.placed(np.zeros(3), 0.0, 1.0, 0.0, duration_s, rest_s)
-    at = path.position(np.arange(0.0, duration_s, 0.05)) - [0, 0, CAMERA_HEIGHT_M]
+    path = recording.placed(np.zeros(3), 0.0, 1.0, 0.0)
+    at = path.position(np.arange(0.0, path.duration_s, 0.05)) - [0, 0, CAMERA_HEIGHT_M]
     steps = np.linalg.norm(np.diff(at, axis=0), axis=1)
     at = at[np.concatenate([[True], steps > 1e-3])]
-    ahead = path.attitude(np.array([0.0, duration_s]))[:, :, 0] * [1, 1, 0]
+    ahead = path.attitude(np.array([0.0, path.duration_s]))[:, :, 0] * [1, 1, 0]
     at = np.concatenate([at[:1] - _BEYOND_M * ahead[0], at, at[-1:] + _BEYOND_M * ahead[1]])
     arc = se3.path_length_m(at)
     even = np.arange(0.0, arc[-1], _STEP_M)

@@ -94,9 +94,7 @@ def simulate_points(scenario: str | PointsScenario, seed: int = 0, **overrides: 
     scene = streams[0]
     if chosen.world_seed is not None:
         scene = np.random.default_rng(np.random.SeedSequence([chosen.world_seed, 77]).spawn(1)[0])
-    path, cloud = clouds.make(
-        chosen.world, chosen.path, chosen.duration_s, chosen.speed_mps, scene, chosen.rest_s, chosen.waypoints
-    )
+    path, cloud = clouds.make(chosen, scene)
     return _fly(chosen, path.motion(chosen.imu_rate_hz), cloud, streams)
 
 

@@ -22,10 +22,13 @@ _UNNOTICED = 0.9
 @dataclass(frozen=True)
 class Recording:
     """Motion relative to its start: ``position_m`` (N, 3) about the middle of its extent, every 0.02 s, z up;
-    ``turned_xyzw`` (N, 4) how far the body has turned since the start, in world axes."""
+    ``turned_xyzw`` (N, 4) how far the body has turned since the start, in world axes; for a flight of ``duration_s``
+    that rests at first."""
 
     position_m: Array
     turned_xyzw: Array
+    duration_s: float
+    rest_s: float
 
     @property
     def main_direction_rad(self) -> float:
@@ -38,9 +41,7 @@ class Recording:
         """Positions (N, 3) of the recording turned about the vertical."""
         return self.position_m @ _about_z(yaw_rad).T
 
-    def placed(
-        self, middle: Array, yaw_rad: float, scale: float, heading_rad: float, duration_s: float, rest_s: float = 3.0
-    ) -> Path3:
+    def placed(self, middle: Array, yaw_rad: float, scale: float, heading_rad: float) -> Path3:
         """The recording as a path: turned by ``yaw_rad``, scaled, its extent about ``middle`` (3,), the body level at
         the start with the nose at ``heading_rad``. Warns where it is made smaller: the speeds are, too."""
         if scale < _UNNOTICED:
@@ -49,19 +50,17 @@ class Recording:
         grid = np.arange(len(self.position_m)) * _STEP_S
         place = make_interp_spline(grid, self.turned_by(yaw_rad) * scale + middle, k=5)
         pose = make_interp_spline(grid, self.turned_xyzw, k=5)
-        t = knots(duration_s)
+        t = knots(self.duration_s)
 
         def attitude(u: Array) -> Array:
-            return turn @ rotations(pose(smooth_start(u, rest_s))) @ turn.T @ _about_z(heading_rad)
+            return turn @ rotations(pose(smooth_start(u, self.rest_s))) @ turn.T @ _about_z(heading_rad)
 
-        return Path3(make_interp_spline(t, place(smooth_start(t, rest_s)), k=5), attitude, duration_s)
+        return Path3(make_interp_spline(t, place(smooth_start(t, self.rest_s)), k=5), attitude, self.duration_s)
 
-    def fitted(
-        self, low: Array, high: Array, duration_s: float, rng: np.random.Generator, rest_s: float = 3.0
-    ) -> Path3:
+    def fitted(self, low: Array, high: Array, rng: np.random.Generator) -> Path3:
         """The recording scaled down to fit a box [m], looking in a random direction at its start."""
         scale = min(1.0, float(((high - low) / np.maximum(np.ptp(self.position_m, axis=0), 1e-6)).min()))
-        return self.placed((high + low) / 2, 0.0, scale, rng.uniform(-np.pi, np.pi), duration_s, rest_s)
+        return self.placed((high + low) / 2, 0.0, scale, rng.uniform(-np.pi, np.pi))
 
 
 def read_recording(file: Path, duration_s: float, rest_s: float = 3.0) -> Recording:
@@ -81,7 +80,7 @@ def read_recording(file: Path, duration_s: float, rest_s: float = 3.0) -> Record
     grid = np.arange(0.0, needed + 0.3, _STEP_S)
     poses = _resample(clock, T_world_body, np.minimum(grid, clock[-1]))
     p, turned = _smoothed(poses[:, :3, 3], poses[:, :3, :3] @ poses[0, :3, :3].T)
-    return Recording(p - (p.max(0) + p.min(0)) / 2, turned)
+    return Recording(p - (p.max(0) + p.min(0)) / 2, turned, duration_s, rest_s)
 
 
 def _read(path: Path) -> tuple[Array, Array]:

@@ -150,7 +150,7 @@ def _place_recording(scenario: Scenario, world: World, recording: Recording, rng
             where=scenario.trajectory,
             cure="another world, a larger one, or a shorter duration",
         )
-    return recording.placed(middle, yaw, scale, heading, scenario.duration_s, scenario.rest_s)
+    return recording.placed(middle, yaw, scale, heading)
 
 
 def _draw_place(scenario: Scenario, world: World, rng: np.random.Generator) -> tuple[Array, float]:

@@ -55,7 +55,7 @@ def test_flown_path_fits_and_keeps_its_turns(tmp_path):
     ]
     file = tmp_path / "flown.txt"
     file.write_text("\n".join(lines) + "\n")
-    path = recorded.read_recording(file, 15.0).fitted(LOW, HIGH, 15.0, np.random.default_rng(0))
+    path = recorded.read_recording(file, 15.0).fitted(LOW, HIGH, np.random.default_rng(0))
     motion = path.motion(100.0)
     assert (motion.position_m > LOW - 0.05).all()
     assert (motion.position_m < HIGH + 0.05).all()
