@@ -11,10 +11,10 @@ import numpy as np
 
 from gpvo import __version__, runner
 from gpvo.errors import GpvoError, OutputError
-from gpvo.files import digest_of_file, write_text
+from gpvo.files import digest_of_file
 from gpvo.io import open_source
 from gpvo.io.run import is_finished
-from gpvo.io.trajectory import read_euroc_csv, read_tum, tum_line
+from gpvo.io.trajectory import read_euroc_csv, read_tum, write_tum
 from gpvo.reproduce.experiments import FLIGHTS, FlightSet, Mode, Plan, sigma_pairs
 from gpvo.reproduce.stages import Store, Workers, digest_of
 from gpvo.sim.scenario import Scenario, load_scenario
@@ -77,8 +77,8 @@ def _cut(recording: Path, seed: int, duration_s: float, store: Store) -> Path:
     path = read_euroc_csv(recording) if recording.suffix.lower() == ".csv" else read_tum(recording)
     clock = (path.t_ns - path.t_ns[0]) * 1e-9
     begin = np.random.default_rng([seed, 4]).uniform(0.0, max(clock[-1] - duration_s, 0.0))
-    keep = np.flatnonzero((clock >= begin - 1e-9) & (clock <= begin + duration_s + 0.5))
-    write_text(target, "".join(f"{tum_line(int(path.t_ns[k]), path.T_world_body[k])}\n" for k in keep))
+    keep = (clock >= begin - 1e-9) & (clock <= begin + duration_s + 0.5)
+    write_tum(target, path.t_ns[keep], path.T_world_body[keep])
     return target
 
 
