@@ -263,13 +263,10 @@ def read_tolerance(text: str) -> tuple[str, Tolerance]:
     if not path.is_file():
         raise GpvoError(f"unknown tolerance '{text}'", cure=cure)
     values = read_toml(path)
-    if not values or set(values) - known or not all(_is_small(v) for v in values.values()):
+    small = all(type(v) in (int, float) and 0 <= v <= 0.2 for v in values.values())
+    if not values or set(values) - known or not small:
         raise GpvoError("does not describe a tolerance: numbers from 0 to 0.2", where=path, cure=cure)
     return path.stem, Tolerance(**{k: float(v) for k, v in values.items()})
-
-
-def _is_small(value: object) -> bool:
-    return isinstance(value, (int, float)) and not isinstance(value, bool) and 0 <= value <= 0.2
 
 
 class _Conditions:
