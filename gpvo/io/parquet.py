@@ -36,7 +36,6 @@ KIND_OF = {
 """Kinds of the columns that are not float64, by name."""
 _TYPE = {"bool": 0, "int32": 1, "int64": 2, "float32": 4, "float64": 5, "string": 6}
 _MAGIC, _GZIP, _PLAIN, _RLE, _OPTIONAL, _UTF8 = b"PAR1", 2, 0, 3, 1, 0
-_I32, _I64, _TEXT, _LIST, _STRUCT = 5, 6, 8, 9, 12
 _LEVEL = 1  # of gzip: covariances hardly shrink further
 MAX_COLUMNS = 4096
 MAX_BYTES = 8_000_000_000
@@ -44,8 +43,7 @@ _BLOCK_ROWS = 50_000
 _MOST_GROUPS = 1000  # of rows: what a file says of each column of each takes 1 kB to write and to read
 _PLAIN_BYTES, _MAX_RATIO = 200_000_000, 200
 _LARGEST = np.float64(1e100)  # No number of a run is larger: products of two or three stay finite.
-
-Fields = Sequence[tuple[int, int, Any]]
+_Struct = dict[int, Any]  # of Thrift: by ids that rise by less than 16, numbers, texts, structures, and lists of these
 
 
 @dataclass(frozen=True)
@@ -109,16 +107,8 @@ def _page(values: Any, kind: str) -> tuple[bytes, int]:
     packer = zlib.compressobj(_LEVEL, zlib.DEFLATED, 31)
     packed = packer.compress(plain) + packer.flush()
     crc = zlib.crc32(packed)
-    of_page = [(1, _I32, len(present)), (2, _I32, _PLAIN), (3, _I32, _RLE), (4, _I32, _RLE)]
-    header = _struct(
-        [
-            (1, _I32, 0),
-            (2, _I32, len(plain)),
-            (3, _I32, len(packed)),
-            (4, _I32, crc - (crc >> 31 << 32)),
-            (5, _STRUCT, of_page),
-        ]
-    )
+    of_page = {1: len(present), 2: _PLAIN, 3: _RLE, 4: _RLE}
+    header = _thrift({1: 0, 2: len(plain), 3: len(packed), 4: crc - (crc >> 31 << 32), 5: of_page})[1]
     return header + packed, len(header) + len(plain)
 
 
@@ -140,61 +130,49 @@ def _encoded(values: Any, kind: str) -> tuple[NDArray[np.bool_], bytes]:
 
 def _footer(groups: Sequence[RowGroup], metadata: Mapping[str, str] | None) -> bytes:
     names = groups[0].names
-    schema: list[Fields] = [[(4, _TEXT, "schema"), (5, _I32, len(names))]]
+    schema: list[_Struct] = [{4: "schema", 5: len(names)}]
     for name in names:
         kind = KIND_OF.get(name, "float64")
-        text = [(6, _I32, _UTF8)] if kind == "string" else []
-        schema.append([(1, _I32, _TYPE[kind]), (3, _I32, _OPTIONAL), (4, _TEXT, name), *text])
-    body = _struct(
-        [
-            (1, _I32, 2),
-            (2, _LIST, (_STRUCT, schema)),
-            (3, _I64, sum(g.rows for g in groups)),
-            (4, _LIST, (_STRUCT, [_group(g) for g in groups])),
-            (5, _LIST, (_STRUCT, [[(1, _TEXT, k), (2, _TEXT, v)] for k, v in (metadata or {}).items()])),
-            (6, _TEXT, "gpvo"),
-        ]
-    )
+        schema.append({1: _TYPE[kind], 3: _OPTIONAL, 4: name} | ({6: _UTF8} if kind == "string" else {}))
+    told = [{1: key, 2: text} for key, text in (metadata or {}).items()]
+    rows = _Long(sum(g.rows for g in groups))
+    body = _thrift({1: 2, 2: schema, 3: rows, 4: [_group(g) for g in groups], 5: told, 6: "gpvo"})[1]
     return body + struct.pack("<I", len(body)) + _MAGIC
 
 
-def _group(group: RowGroup) -> Fields:
-    chunks: list[Fields] = []
-    for name, (offset, size, plain) in zip(group.names, group.place.tolist()):
-        about = [
-            (1, _I32, _TYPE[KIND_OF.get(name, "float64")]),
-            (2, _LIST, (_I32, [_PLAIN, _RLE])),
-            (3, _LIST, (_TEXT, [name])),
-            (4, _I32, _GZIP),
-            (5, _I64, group.rows),
-            (6, _I64, plain),
-            (7, _I64, size),
-            (9, _I64, offset),
-        ]
-        chunks.append([(2, _I64, offset), (3, _STRUCT, about)])
-    return [(1, _LIST, (_STRUCT, chunks)), (2, _I64, int(group.place[:, 2].sum())), (3, _I64, group.rows)]
+def _group(group: RowGroup) -> _Struct:
+    columns: list[_Struct] = []
+    for name, place in zip(group.names, group.place.tolist()):
+        offset, size, plain = map(_Long, place)
+        about = {1: _TYPE[KIND_OF.get(name, "float64")], 2: [_PLAIN, _RLE], 3: [name], 4: _GZIP}
+        about |= {5: _Long(group.rows), 6: plain, 7: size, 9: offset}
+        columns.append({2: offset, 3: about})
+    return {1: columns, 2: _Long(group.place[:, 2].sum()), 3: _Long(group.rows)}
 
 
-def _struct(fields: Fields) -> bytes:
-    """A Thrift structure of (id, type, value), ids rising by less than 16."""
-    out, before = [], 0
-    for number, kind, value in fields:
-        out.append(bytes([(number - before) << 4 | kind]) + _value(kind, value))
-        before = number
-    return b"".join(out) + b"\x00"
+class _Long(int):
+    """A number of 64 bits, which Thrift tells from one of 32."""
 
 
-def _value(kind: int, value: Any) -> bytes:
-    if kind == _STRUCT:
-        return _struct(value)
-    if kind == _TEXT:
+def _thrift(value: Any) -> tuple[int, bytes]:
+    """Thrift's number for the type of a value, and the value in its compact protocol."""
+    if isinstance(value, dict):
+        out, before = [], 0
+        for number, held in value.items():
+            kind, data = _thrift(held)
+            out.append(bytes([(number - before) << 4 | kind]) + data)
+            before = number
+        return 12, b"".join(out) + b"\x00"
+    if isinstance(value, str):
         text = value.encode()
-        return _varint(len(text)) + text
-    if kind == _LIST:
-        of, entries = value
-        head = bytes([len(entries) << 4 | of]) if len(entries) < 15 else bytes([0xF0 | of]) + _varint(len(entries))
-        return head + b"".join(_value(of, entry) for entry in entries)
-    return _varint(value << 1 ^ value >> 63)  # zigzag
+        return 8, _varint(len(text)) + text
+    if isinstance(value, list):
+        kinds, entries = zip(*map(_thrift, value)) if value else ((12,), ())
+        head = (
+            bytes([len(value) << 4 | kinds[0]]) if len(value) < 15 else bytes([0xF0 | kinds[0]]) + _varint(len(value))
+        )
+        return 9, head + b"".join(entries)
+    return 6 if isinstance(value, _Long) else 5, _varint(value << 1 ^ value >> 63)  # zigzag
 
 
 def _varint(value: int) -> bytes:
