@@ -159,9 +159,11 @@ def read_table(path: Path, mapping: Mapping[str, str]) -> Table:
     check_interval(stamps, path, lambda unit: _unit_cure(column, unit), is_stated=is_stated)
     data = np.array(rows, dtype=np.float64)
     unused = tuple(c for k, c in enumerate(header) if k not in targets.values() and _TELLING.search(c))
-    columns = {n: data[:, i] * _to_si(header[targets[n]], n) for i, n in enumerate(order)}
+    named = {n: header[targets[n]] for n in order}
+    to_si = {n: _to_si(column, n) or 1.0 for n, column in named.items()}  # of a unit unknown, --map says which
+    columns = {n: data[:, i] * to_si[n] for i, n in enumerate(order)}
     axes = "mixed" if "cov_33" in targets and _plain(header[targets["cov_33"]]) in _OPENVINS else "world"
-    notes = (*(() if top else (NO_HEADER,)), *_units_apart({n: header[targets[n]] for n in order}))
+    notes = (*(() if top else (NO_HEADER,)), *_units_apart(named, to_si))
     return Table(np.array(stamps, dtype=np.int64), columns, numbers, unused, notes, axes)
 
 
@@ -230,7 +232,7 @@ def is_tum(names: list[str]) -> bool:
     layout = ("t_s", *_POSE)
     if tuple(map(_suggest, names)) != layout:
         return False
-    return all(_unknown_unit(*pair) is None and _to_si(*pair) == 1.0 for pair in zip(names, layout))
+    return all(_to_si(*pair) == 1.0 for pair in zip(names, layout))
 
 
 def _targets(path: Path, header: list[str], mapping: Mapping[str, str]) -> dict[str, int]:
@@ -299,25 +301,18 @@ def _plain(column: str) -> str:
     return re.sub(r"[./ ]+", "_", re.sub(r"[\[(].*?[\])]", "", column).strip().lower()).lstrip("#%").strip("_")
 
 
-def _to_si(column: str, target: str) -> float:
+def _to_si(column: str, target: str) -> float | None:
     """What the numbers of a column are multiplied by to be metres or radians, of a covariance their squares or
-    products, by the unit in its name; 1 where that states none."""
+    products, by the unit in its name; 1 where that states none, None where that in its brackets is none that is read.
+    """
+    known, axes = _units(target), target[4:] if target in _COV else ""
     unit = _UNIT.search(column.strip().lower()) or _UNIT.search(_plain(column))
-    if unit is None or target[:2] not in ("p_", "co"):
-        return 1.0
-    units = [_ANGLES_RAD if axis in "345" else _LENGTHS_M for axis in target[4:]] or [_LENGTHS_M]
-    if not all(unit[1] in known for known in units):
-        return 1.0
-    return float(np.prod([known[unit[1]] for known in units]))
-
-
-def _unknown_unit(column: str, target: str) -> str | None:
-    """The unit that the name of a column states in brackets, if it is none that is read."""
-    stated, known = _BRACKETS.search(column), {name for name, size in _units(target).items() if size == 1.0}
-    words = set(re.findall(r"[^\W\d_]+", stated[1].lower())) if stated else set()
-    if stated is None or not known or words <= known or _to_si(column, target) != 1.0:
-        return None
-    return stated[1]
+    of_axes = [_ANGLES_RAD if axis in "345" else _LENGTHS_M for axis in axes] or [known]
+    sizes = [of_axis[unit[1]] for of_axis in of_axes if unit[1] in of_axis] if unit else []
+    size = float(np.prod(sizes)) if len(sizes) == len(of_axes) else 1.0
+    stated, si = _BRACKETS.search(column), {name for name, of_si in known.items() if of_si == 1.0}
+    is_read = size != 1.0 or not (stated and si) or si >= set(re.findall(r"[^\W\d_]+", stated[1].lower()))
+    return size if is_read else None
 
 
 def _units(target: str) -> dict[str, float]:
@@ -334,8 +329,8 @@ def _check_unit(path: Path, column: str, target: str) -> None:
 
     Raises SourceError, naming the column.
     """
-    stated = _unknown_unit(column, target)
-    if stated is None:
+    stated = _BRACKETS.search(column)
+    if stated is None or _to_si(column, target) is not None:
         return
     if target in _STAMPS:
         cure = f"write seconds, or {_unit_cure(column, 's')}"
@@ -343,13 +338,13 @@ def _check_unit(path: Path, column: str, target: str) -> None:
         short = ", ".join(name for name in _units(target) if len(name) < 5)
         si = "metres" if target in _POSE else "of metres and radians"
         cure = f"units are {short}; if it is {si}, --map {shlex.quote(f'{column}={target}')}, of truth --truth-map"
-    what = f"the column '{column}' is in '{stated}', which is no unit that is read"
+    what = f"the column '{column}' is in '{stated[1]}', which is no unit that is read"
     raise SourceError(what, where=path, cure=cure)
 
 
-def _units_apart(named: Mapping[str, str]) -> Iterator[str]:
+def _units_apart(named: Mapping[str, str], to_si: Mapping[str, float]) -> Iterator[str]:
     """A remark where positions state a unit that is converted, and covariances none; ``named``: columns by target."""
-    odd = [column for target, column in named.items() if target[:2] == "p_" and _to_si(column, target) != 1.0]
+    odd = [column for target, column in named.items() if target[:2] == "p_" and to_si[target] != 1.0]
     if odd and any(target[:4] == "cov_" and not _UNIT.search(column) for target, column in named.items()):
         yield f"{odd[0]} is converted to metres, the covariances, which name no unit, are not"
 
