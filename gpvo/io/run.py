@@ -146,12 +146,10 @@ class RunWriter:
         now.count(record)
         if self.kept is not None and now.records_total <= len(self.kept.records):
             return
-        now.records.append(as_stored(record))
-        if prediction is not None:
-            now.predictions.append(prediction)
-        if tracks is not None:
-            now.tracks.append(tracks)
-        if len(now.records) >= self._chunk:
+        for kind, row in (("log", as_stored(record)), ("predictions", prediction), ("tracks", tracks)):
+            if row is not None:
+                now.pending.setdefault(kind, []).append(row)
+        if len(now.pending["log"]) >= self._chunk:
             self.flush()
             if self._resume is not None:
                 save_snapshot(self._chunks / run_folder.STATE, self._resume, (now.chunks, state))
@@ -163,19 +161,14 @@ class RunWriter:
     def flush(self) -> None:
         """Write the records so far as one chunk, which survives a kill."""
         state = self._state
-        if state.records:
-            tables: dict[str, Mapping[str, Any]] = {"log": run_table.record_columns(state.records)}
-            if state.predictions:
-                tables["predictions"] = run_table.prediction_columns(state.predictions)
-            if state.tracks:
-                tables["tracks"] = run_table.track_columns(state.tracks)
-            for kind, columns in tables.items():
-                part = write_table(self._chunks / f"{kind}_{state.chunks:06d}.parquet", columns)
-                state.written.setdefault(kind, []).append(part)
+        for kind, rows in state.pending.items():
+            part = write_table(self._chunks / f"{kind}_{state.chunks:06d}.parquet", run_table.COLUMNS_OF[kind](rows))
+            state.written.setdefault(kind, []).append(part)
+        if state.lines:  # of a run that is resumed, also those of the records that it left
             with (self.path / "trajectory.tum").open("a", encoding="ascii", newline="\n") as file:
                 file.writelines(line + "\n" for line in state.lines)
-            state.chunks += 1
-        state.records, state.predictions, state.lines, state.tracks = [], [], [], []
+        state.chunks += bool(state.pending)
+        state.pending, state.lines = {}, []
 
     def close(self, *, complete: bool = True) -> None:
         """Join the chunks and finish ``run.json``; ``complete=False`` leaves a run that broke off in its chunks."""
@@ -225,10 +218,8 @@ class RunWriter:
 class _State:
     """What the writer carries from record to record; its size does not grow with the run."""
 
-    records: list[VoRecord] = field(default_factory=list)
-    predictions: list[Prediction] = field(default_factory=list)
+    pending: dict[str, list[Any]] = field(default_factory=dict)  # rows of each table
     lines: list[str] = field(default_factory=list)
-    tracks: list[StereoTracks] = field(default_factory=list)
     written: dict[str, list[RowGroup]] = field(default_factory=dict)
     poses: OrderedDict[int, Array] = field(default_factory=OrderedDict)
     statuses: Counter[str] = field(default_factory=Counter)

@@ -26,8 +26,6 @@ FILES = (
 )  # fmt: skip
 OWN = (*FILES, "config.toml", "run.json", "calibration_state.json")
 """All files of a run; its folder may hold others."""
-KINDS = ("log", "predictions", "tracks")
-"""Tables that are written in chunks."""
 STATE = "state.npz"
 """In the folder of the chunks: how many there are, and where what made them stood."""
 
@@ -47,7 +45,7 @@ def take_up(chunks: Path, key: str) -> Kept | None:
     found = load_snapshot(chunks / STATE, key)
     try:
         count, state = found
-        parts = {kind: sorted(chunks.glob(f"{kind}_*.parquet")) for kind in KINDS}
+        parts = {kind: sorted(chunks.glob(f"{kind}_*.parquet")) for kind in run_table.COLUMNS_OF}
         late = [p for paths in parts.values() for p in paths if int(p.stem.rpartition("_")[2]) >= count]
         kept = {kind: [p for p in paths if p not in late] for kind, paths in parts.items() if paths}
         records = StoredRecords.join([run_table.records_from(read_columns(path)[0]) for path in kept["log"]])

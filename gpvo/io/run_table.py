@@ -9,7 +9,7 @@ for x, y, z [m] and the rotations about x, y, z [rad]; ``vt_<method>_<i><j>`` is
 from __future__ import annotations
 
 import re
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import fields
 from typing import Any
 
@@ -202,6 +202,12 @@ def predictions_from(columns: Mapping[str, NDArray[Any]]) -> StoredPredictions:
             "nu": np.asarray(columns.get("nu", np.full(n, np.inf)), dtype=np.float64),
         }
     )
+
+
+COLUMNS_OF: dict[str, Callable[[Any], Columns]] = {
+    "log": record_columns, "predictions": prediction_columns, "tracks": track_columns
+}  # fmt: skip
+"""By kind, how rows of the tables that are written in chunks become columns."""
 
 
 def truth_columns(truth: TruthLog) -> dict[str, NDArray[Any]]:

@@ -216,6 +216,21 @@ def test_killed_run_reads_up_to_the_last_chunk(tmp_path):
     assert len(read_run(tmp_path / "run").log) == 10
 
 
+def test_a_run_killed_after_its_last_record_keeps_its_trajectory(tmp_path):
+    records = make_records(80)
+    writer = RunWriter(tmp_path / "run", chunk=40, resume="key")
+    for record in records:
+        writer.append(record)
+    del writer
+    write_run(tmp_path / "whole", VoLog(records))
+    with RunWriter(tmp_path / "run", chunk=40, resume="key") as writer:
+        assert writer.kept is not None
+        for record in records:
+            writer.append(record)
+    trajectory, whole = ((tmp_path / name / "trajectory.tum").read_text() for name in ("run", "whole"))
+    assert trajectory == whole
+
+
 def _interrupted_run(path) -> None:
     with RunWriter(path, chunk=40) as writer:
         for record in make_records(130):
