@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import tempfile
 from collections.abc import Iterator
-from dataclasses import asdict, dataclass, replace
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -14,15 +14,16 @@ from gpvo.cli.common import is_given, refuse_twice
 from gpvo.cli.output import Json, cell, note, print_json, progress, say, show, status, time_offset
 from gpvo.cli.twin import TwinOptions, Twins, in_place_of_runs_without_truth
 from gpvo.dataset.errors import motion_errors
+from gpvo.dataset.misread import Misread, late_by
 from gpvo.dataset.truth_noise import made_from_odometry
 from gpvo.errors import GpvoError, counted
 from gpvo.files import refuse_folder
 from gpvo.io.run import read_run
 from gpvo.io.run_read import read_meta
+from gpvo.learning.config import TrainConfig, lacking
 
 if TYPE_CHECKING:
     from gpvo.dataset.build import TrainingSet
-    from gpvo.learning.config import TrainConfig
     from gpvo.learning.train import OnFit, TrainedModel
 
 _MOST_COLUMNS = 3  # of folds: more do not fit into 80 columns
@@ -30,30 +31,12 @@ _MOST_COLUMNS = 3  # of folds: more do not fit into 80 columns
 Runs = Annotated[list[Path], "Run folders with ground truth, or one file of training rows."]
 
 
-@dataclass(frozen=True)
-class TrainOptions:
-    """What is learned, from which rows; a model that is updated keeps its own."""
-
-    features: Annotated[str, "auto, thesis, full, or a list of groups and columns."] = "auto"
-    target: Annotated[str, "frame, window:1s, length:1m or position."] = "frame"
-    regressor: Annotated[str, "Regressor for --target position: auto, exact, sparse, svgp or sklearn."] = "auto"
-    align: Annotated[str, "First fit between log and truth: a fixed rotation, transform (with lever arm) or none."] = (
-        "none"
-    )
-    time_offset_s: Annotated[str, "--time-offset", "Seconds to add to the logs' clock, or auto (for each)."] = "0"
-    waits: Annotated[str, "--stationary", "--waits", "Motions where truth wanders at rest, or jumps: drop or keep."] = (
-        "drop"
-    )
-    odd: Annotated[str, "Stretches where odometry and truth differ far more than elsewhere: keep or drop."] = "keep"
-    max_rows: Annotated[int, "Rows held in memory; more are streamed in blocks.", {"min": 1000}] = 100_000
-    seed: Annotated[int, "Random seed."] = 0
-
-
 def train(
     ctx: typer.Context,
     runs: Runs,
     out: Annotated[Path, "Model file to write."],
-    options: TrainOptions = TrainOptions(),
+    options: TrainConfig = TrainConfig(),
+    time_offset_s: Annotated[str, "--time-offset", "Seconds to add to the logs' clock, or auto (for each)."] = "0",
     update: Annotated[
         Path | None, "Add the runs to the training rows of this model and train again, with its settings."
     ] = None,
@@ -77,21 +60,21 @@ def train(
         from gpvo.learning.store import config_of, folds_path, refuse_foreign_model, save_model
 
     refuse_foreign_model(out)
-    settings = asdict(options) | {"time_offset_s": time_offset(options.time_offset_s)}
-    if update is not None:
-        settings = asdict(config_of(update)) | {k: v for k, v in settings.items() if is_given(ctx, k)}
-    settings |= {"jobs": jobs, "backend": backend, "scheduler": scheduler}
-    settings["keep"] = str(folds_path(out)) if backend == "local" else None
+    config = replace(options, time_offset_s=time_offset(time_offset_s))
+    if update is not None:  # which keeps its own settings
+        config = replace(config_of(update), **{k: v for k, v in vars(config).items() if is_given(ctx, k)})
+    keep = str(folds_path(out)) if backend == "local" else None
+    config = replace(config, jobs=jobs, backend=backend, scheduler=scheduler, keep=keep)
     refuse_folder(statements)
     if statements is not None:
-        _check_statements(runs, settings, update)
+        _check_statements(runs, config, update)
     drawn = twin_options.asked(ctx, twins, options.seed)
     with in_place_of_runs_without_truth(runs, drawn, jobs) as paths:
         with progress("models") as on_fit:
-            trained = _with_origin(_train(paths, settings, update, on_fit), paths, update)
+            trained = _with_origin(_train(paths, config, update, on_fit), paths, update)
         if statements is not None:
-            _write_statements(trained, paths, settings, statements)
-    _tell(trained, settings)
+            _write_statements(trained, paths, config, statements)
+    _tell(trained, config)
     save_model(trained, out)
     document = {**trained.table, "model": str(out)}
     if json_:
@@ -104,9 +87,8 @@ def train(
         print(f"{out}: {kept} rows of {counted(len(trained.sets), 'run')}{streamed}")
 
 
-def _tell(trained: TrainedModel, settings: dict[str, Any]) -> None:
+def _tell(trained: TrainedModel, config: TrainConfig) -> None:
     """Notes on what a model could not learn, and on truths whose noise it did not."""
-    from gpvo.learning.config import TrainConfig, lacking
     from gpvo.learning.train import unseen_axes
 
     if trained.header["target"] != "position":
@@ -115,7 +97,7 @@ def _tell(trained: TrainedModel, settings: dict[str, Any]) -> None:
                 f"gpvo: log and truth never differ in {', '.join(axes)} (planar?): the model states almost no error"
                 " there"
             )
-        for name, missing in lacking(trained.sets, TrainConfig(**settings)).items():
+        for name, missing in lacking(trained.sets, config).items():
             note(
                 f"gpvo: {name} holds no {', '.join(missing)}, as other runs do: the model does without them. If it is"
                 " another odometry's, train a model for each"
@@ -131,7 +113,6 @@ def _rows(paths: list[Path], config: TrainConfig) -> Iterator[TrainingSet]:
     """Of one run after the other, with a note if its poses or stamps, or those of its truth, seem not to be what they
     are taken for."""
     from gpvo.dataset.build import aligned
-    from gpvo.dataset.misread import Misread, late_by
 
     as_is = replace(config, align="none", time_offset_s=0.0)
     for path in paths:
@@ -152,19 +133,18 @@ def _rows(paths: list[Path], config: TrainConfig) -> Iterator[TrainingSet]:
         yield as_is.rows_of(run)
 
 
-def _check_statements(runs: list[Path], settings: dict[str, Any], update: Path | None) -> None:
+def _check_statements(runs: list[Path], config: TrainConfig, update: Path | None) -> None:
     """Raise GpvoError, before any work, if training would leave out no run that ``gpvo score`` could judge."""
     whole = len(runs) > 1 and all(p.is_dir() for p in runs) and update is None
-    if not whole or settings["target"] != "frame" or settings["backend"] != "local":
+    if not whole or config.target != "frame" or config.backend != "local":
         text = "--statements needs two or more run folders, --target frame and --backend local, without --update"
         raise GpvoError(text, cure="or give one run at a time to gpvo evaluate RUN --model MODEL --stated FOLDER")
 
 
-def _write_statements(trained: TrainedModel, paths: list[Path], settings: dict[str, Any], folder: Path) -> None:
+def _write_statements(trained: TrainedModel, paths: list[Path], config: TrainConfig, folder: Path) -> None:
     from gpvo.evaluation.score import write_left_out
-    from gpvo.learning.config import TrainConfig
 
-    write_left_out(trained, [read_run(p) for p in paths], TrainConfig(**settings), folder)
+    write_left_out(trained, [read_run(p) for p in paths], config, folder)
     note(f"gpvo: {folder} holds the covariances stated for the runs left out; to score them: gpvo score {folder}")
 
 
@@ -178,13 +158,11 @@ def _with_origin(trained: TrainedModel, paths: list[Path], update: Path | None) 
     return replace(trained, header={**trained.header, "simulated_truth": origin}) if origin else trained
 
 
-def _train(paths: list[Path], settings: dict[str, Any], update: Path | None, on_fit: OnFit) -> TrainedModel:
+def _train(paths: list[Path], config: TrainConfig, update: Path | None, on_fit: OnFit) -> TrainedModel:
     from gpvo.dataset.table import write_sets
     from gpvo.learning import store
     from gpvo.learning import train as learning
-    from gpvo.learning.config import TrainConfig
 
-    config = TrainConfig(**settings)
     refuse_twice(paths)
     if config.regressor != "auto" and config.target != "position":
         note("gpvo: --regressor applies only to --target position; the log-variance GP is always sparse")

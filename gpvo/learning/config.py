@@ -5,14 +5,16 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Annotated, Any
 
-from gpvo.dataset.build import TrainingSet, build_run
 from gpvo.errors import GpvoError
 from gpvo.io.run_read import Run
 from gpvo.online.base import ACCELERATION_COLUMNS, RESIDUAL_COLUMN, TWIST_COLUMNS
 from gpvo.online.features import AXES, GEOMETRIC_METHODS, groups, resolve
 from gpvo.types import IMPORTED
+
+if TYPE_CHECKING:
+    from gpvo.dataset.build import TrainingSet
 
 AGILITY = ("ln_speed", "ln_turn_rate", "ln_jerk", "ln_angular_jerk", "ln_jerk_lately", "ln_angular_jerk_lately")
 TRACKING = ("n_inliers", "inlier_ratio", "ln_disparity_p50", "spread_u", "spread_v", "ln_reproj_rms")
@@ -34,27 +36,28 @@ first."""
 
 @dataclass(frozen=True)
 class TrainConfig:
-    """``features``: ``auto`` (by cross-validation over the sequences), ``thesis``, ``full`` or names with commas.
+    """What is learned, from which rows; what ``gpvo train`` has an option for, with its help.
 
-    ``target``: ``frame``, ``window:1s``, ``length:1m`` or ``position``. ``regressor``, ``inducing``: of positions, the
-    latter the points of its GP. ``align``: ``rotation`` or ``transform`` first fits that between each log and its
-    truth, to whose clock ``time_offset_s`` brings the log, None by an estimate. ``waits``: ``drop`` leaves out waits in
-    which the truth moves; ``odd`` does the same for stretches in which odometry and truth differ far more than
-    elsewhere. ``max_rows``: held in memory; the rest of larger files is streamed. ``jobs``, ``backend`` (``local`` or
-    ``dask``), ``scheduler``: where folds are fitted. ``keep``: folder for finished folds, which an interrupted training
-    does not fit again; None keeps none.
+    ``features``: ``auto`` chooses by cross-validation over the sequences. ``inducing``: points of the GP of positions.
+    ``time_offset_s`` brings each log to the clock of its truth, None by an estimate. ``jobs``, ``backend`` (``local``
+    or ``dask``), ``scheduler``: where folds are fitted. ``keep``: folder for finished folds, which an interrupted
+    training does not fit again; None keeps none.
     """
 
-    features: str = "auto"
-    target: str = "frame"
-    regressor: str = "auto"
-    seed: int = 0
-    align: str = "none"
+    features: Annotated[str, "auto, thesis, full, or a list of groups and columns."] = "auto"
+    target: Annotated[str, "frame, window:1s, length:1m or position."] = "frame"
+    regressor: Annotated[str, "Regressor for --target position: auto, exact, sparse, svgp or sklearn."] = "auto"
+    seed: Annotated[int, "Random seed."] = 0
+    align: Annotated[str, "First fit between log and truth: a fixed rotation, transform (with lever arm) or none."] = (
+        "none"
+    )
     time_offset_s: float | None = 0.0
-    waits: str = "drop"
-    odd: str = "keep"
+    waits: Annotated[str, "--stationary", "--waits", "Motions where truth wanders at rest, or jumps: drop or keep."] = (
+        "drop"
+    )
+    odd: Annotated[str, "Stretches where odometry and truth differ far more than elsewhere: keep or drop."] = "keep"
     inducing: int = 256
-    max_rows: int = 100_000
+    max_rows: Annotated[int, "Rows held in memory; more are streamed in blocks.", {"min": 1000}] = 100_000
     jobs: int = 1
     backend: str = "local"
     scheduler: str | None = None
@@ -67,6 +70,8 @@ class TrainConfig:
 
     def rows_of(self, run: TrainingSet | Run | str | Path) -> TrainingSet:
         """The training set of a run, or of its folder, under these settings; one that is made already is returned."""
+        from gpvo.dataset.build import TrainingSet, build_run  # of odometry, which the options alone do not need
+
         if isinstance(run, TrainingSet):
             return run
         how: dict[str, Any] = {k: getattr(self, k) for k in ("target", "align", "time_offset_s", "waits", "odd")}
