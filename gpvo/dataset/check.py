@@ -118,21 +118,17 @@ def odometry_problems(predictor: Predictor, settings: Mapping[str, Any]) -> list
     here = that_matter(settings)
     if here and predictor.camera is None:
         return ["the model was trained on another odometry's poses, not on images"]
+    unread = {k for k, method in _COVARIANCE.items() if not any(method in name for name in predictor.features)}
     other = [
         f"{k} is {_word(v)}, not {_word(trained[k])}"
         for k, v in here.items()
-        if k in trained and trained[k] != v and _is_read(predictor, k)
+        if k in trained and trained[k] != v and k not in unread
     ]
     return [f"the model was trained on odometry with other settings: {'; '.join(other)}"] if other else []
 
 
 # The covariance that a setting is for: it does not matter to a model that reads another.
 _COVARIANCE = {"sigma_px": "triangulation", "sigma_p_px": "pointing_matching", "sigma_m_px": "pointing_matching"}
-
-
-def _is_read(predictor: Predictor, setting: str) -> bool:
-    """Whether a model reads what this setting of the odometry changes."""
-    return setting not in _COVARIANCE or any(_COVARIANCE[setting] in name for name in predictor.features)
 
 
 def _word(value: object) -> object:

@@ -30,7 +30,7 @@ from gpvo.io.trajectory import (
     read_kitti_poses,
     read_times,
 )
-from gpvo.types import Array, ImuNoise, TruthLog
+from gpvo.types import Array, TruthLog
 
 # Folders with poses, the best first. A laser tracker (leica0) gives positions alone and is no truth of motions.
 _EUROC_TRUTH = (
@@ -66,7 +66,9 @@ class EurocSource(FileSource):
         pairs = [PairFiles(t, *(c / "data" / name for c, name in zip(cameras, names))) for t, *names in matched]
         super().__init__(path, path.resolve().name, rig, pairs, known, **options)
         if (samples := mav / "imu0" / "data.csv").is_file():
-            noise = _imu_noise(path, mav)
+            stated = (mav / "imu0" / "sensor.yaml", path / "dso" / "imu_config.yaml", path / "imu.yaml")
+            known_of = (p for p in stated if p.is_file() and "gyroscope_noise_density" in calibration_text(p))
+            noise = next(map(read_imu_noise, known_of), None)
             self.imu = read_imu_csv(samples, shift_s=rig.timeshift_cam_imu_s, noise=noise, remark=self.remark)
         self.truth = self._read_truth(mav)
         if self.truth is None and (mav / "leica0").is_dir():
@@ -135,13 +137,6 @@ def _read_image_list(path: Path, known: SourceReport) -> list[tuple[int, str]]:
     if in_time != out:
         known.note(f"{path.parent.name}/{path.name} is not in time order: sorted by stamp")
     return in_time
-
-
-def _imu_noise(path: Path, mav: Path) -> ImuNoise | None:
-    for candidate in (mav / "imu0" / "sensor.yaml", path / "dso" / "imu_config.yaml", path / "imu.yaml"):
-        if candidate.is_file() and "gyroscope_noise_density" in calibration_text(candidate):
-            return read_imu_noise(candidate)
-    return None
 
 
 def _marker_to_imu(mav: Path, folder: str) -> Array:

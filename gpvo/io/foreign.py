@@ -25,12 +25,6 @@ from gpvo.stats.consistency import SEEN, seen_axes
 from gpvo.types import COUNT_FIELDS, FLOAT_FIELDS, Array
 
 FORMATS = ("tum", "kitti", "csv", "bag")
-_READ_BY = {
-    "--map": ("csv",),
-    "--topic": ("bag",),
-    "--covariance-of motion": ("csv",),
-    "--covariance-axes": ("csv", "bag"),
-}
 COVARIANCE_AXES = ("auto", "world", "body", "mixed")
 PLACES = {
     "cam": np.eye(4),
@@ -183,11 +177,15 @@ def read_foreign(
         raise SourceError(f"covariances are of pose or motion, in axes {' or '.join(COVARIANCE_AXES)}", where=p)
     if not p.exists():
         raise SourceError("no such file", where=p)
-    asked = {"--map": mapping, "--topic": topic, "--covariance-of motion": covariance_of == "motion"}
-    asked |= {"--covariance-axes": covariance_axes != "auto"}
-    if idle := [option for option, value in asked.items() if value and name not in _READ_BY[option]]:
-        cure = "leave it out, or name the format with --format or --truth-format"
-        raise SourceError(f"{idle[0]} has no effect on this file ({name})", where=p, cure=cure)
+    for option, is_asked, formats in (
+        ("--map", mapping, ("csv",)),
+        ("--topic", topic, ("bag",)),
+        ("--covariance-of motion", covariance_of == "motion", ("csv",)),
+        ("--covariance-axes", covariance_axes != "auto", ("csv", "bag")),
+    ):
+        if is_asked and name not in formats:
+            cure = "leave it out, or name the format with --format or --truth-format"
+            raise SourceError(f"{option} has no effect on this file ({name})", where=p, cure=cure)
     if name == "tum":
         return ForeignLog(p, read_tum(p))
     if name == "kitti":
