@@ -11,13 +11,14 @@ from __future__ import annotations
 import re
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import fields
+from itertools import chain
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from gpvo.geometry import se3
-from gpvo.geometry.covariance import from_upper, scaled_root
+from gpvo.geometry.covariance import from_upper, scaled_root, upper
 from gpvo.types import (
     COUNT_FIELDS,
     FLOAT_FIELDS,
@@ -43,9 +44,7 @@ _QUATERNION = ("q_x", "q_y", "q_z", "q_w")
 _ROTATION = tuple(f"R_{i}{j}" for i in range(3) for j in range(3))
 _TWIST = tuple(f"v_{a}_mps" for a in _AXES) + tuple(f"w_{a}_radps" for a in _AXES)
 _IMU = {name: "{}_{{}}_{}".format(*name.rsplit("_", 1)) for name in IMU_FIELDS}
-_UPPER6 = tuple((i, j) for i in range(6) for j in range(i, 6))
 _ALL6 = tuple((i, j) for i in range(6) for j in range(6))
-_UPPER3 = tuple((i, j) for i in range(3) for j in range(i, 3))
 _METHOD = re.compile(r"(cov|vt)_([A-Za-z][A-Za-z0-9_]*)_00")
 _VELOCITY, _GYRO, _ACC = (tuple(p.format(a) for a in _AXES) for p in ("v_{}_mps", "gyro_{}_radps", "acc_{}_mps2"))
 _SIGMA6 = tuple(f"{a}_m" for a in _AXES) + tuple(f"r{a}_rad" for a in _AXES)
@@ -104,9 +103,9 @@ def record_columns(records: Sequence[VoRecord]) -> Columns:
     for name, pattern in _IMU.items():
         vectors = np.array([np.full(3, np.nan) if v is None else v for v in (getattr(r, name) for r in records)])
         out |= dict(zip(map(pattern.format, _AXES), vectors.T))
-    out |= _matrix_columns("cov", [r.covariances for r in records], _UPPER6)
-    out |= _matrix_columns("vt", [r.v_t for r in records], _UPPER3)
-    for stage in _union(r.stage_ms for r in records):
+    out |= _matrix_columns("cov", {m: log.covariance(m) for m in log.methods})
+    out |= _matrix_columns("vt", {m: log.v_t(m) for m in log.v_t_methods})
+    for stage in dict.fromkeys(stage for r in records for stage in r.stage_ms):
         out[f"stage_{stage}_ms"] = [r.stage_ms.get(stage) for r in records]
     return out
 
@@ -158,7 +157,7 @@ def prediction_columns(predictions: Iterable[Prediction]) -> Columns:
     for i, axis in enumerate(_SHORT6):
         out |= {f"epistemic_var_{axis}": of["epistemic"][:, i], f"bias_tau_{axis}_s": tau[:, i]}
     parts = {"total": errors.covariance, "jitter": errors.jitter, "white": errors.white, "bias": errors.persistent}
-    out |= {f"cov_{part}_{i}{j}": C[:, i, j] for part, C in parts.items() for i, j in _UPPER6}
+    out |= _matrix_columns("cov", parts)
     if (tau[:, 6:] != 1.0).any():
         out |= {f"root_calibration_{i}{j}": errors.persistent_root[:, i, 6 + j] for i, j in _ALL6}
         out |= {f"calibration_tau_{axis}_s": tau[:, 6 + i] for i, axis in enumerate(_SHORT6)}
@@ -239,27 +238,22 @@ def _stacked(columns: Mapping[str, NDArray[Any]], names: Iterable[str]) -> Array
     return np.stack([columns[name] for name in names], axis=-1)
 
 
-def _union(maps: Iterable[Mapping[str, Any]]) -> list[str]:
-    return list(dict.fromkeys(key for m in maps for key in m))
+def _elements(prefix: str, method: str, n: int) -> list[str]:
+    """Columns of the elements of symmetric (n, n) matrices, in the order of :func:`gpvo.geometry.covariance.upper`."""
+    return [f"{prefix}_{method}_{i}{j}" for i, j in zip(*np.triu_indices(n))]
 
 
-def _matrix_columns(
-    prefix: str, maps: Sequence[Mapping[str, Array]], elements: tuple[tuple[int, int], ...]
-) -> dict[str, Array]:
-    """The elements of square matrices by method, NaN where a map has none of that method."""
-    out, absent = {}, np.full((6, 6), np.nan)
-    for method in _union(maps):
-        for i, j in elements:
-            out[f"{prefix}_{method}_{i}{j}"] = np.array([m.get(method, absent)[i, j] for m in maps])
-    return out
+def _matrix_columns(prefix: str, matrices: Mapping[str, Array]) -> dict[str, Array]:
+    """The elements of symmetric (N, n, n) matrices by method."""
+    named = (zip(_elements(prefix, method, C.shape[-1]), upper(C).T) for method, C in matrices.items())
+    return dict(chain.from_iterable(named))
 
 
 def _matrices_from(columns: Mapping[str, NDArray[Any]], prefix: str, n: int) -> dict[str, Array]:
     """(N, n (n + 1) / 2) upper triangles of symmetric (n, n) matrices by method, of :func:`_matrix_columns`."""
     found = (_METHOD.fullmatch(name) for name in columns)
     methods = [match[2] for match in found if match is not None and match[1] == prefix]
-    indices = np.transpose(np.triu_indices(n))
-    return {m: _stacked(columns, (f"{prefix}_{m}_{i}{j}" for i, j in indices)).astype(np.float64) for m in methods}
+    return {m: _stacked(columns, _elements(prefix, m, n)).astype(np.float64) for m in methods}
 
 
 def _float(columns: Mapping[str, NDArray[Any]], name: str, n: int) -> Array:
