@@ -5,7 +5,7 @@ from __future__ import annotations
 import inspect
 import math
 from collections.abc import Callable, Iterable, Iterator, Mapping
-from dataclasses import MISSING, asdict, dataclass, fields, is_dataclass
+from dataclasses import asdict, dataclass, is_dataclass
 from difflib import get_close_matches
 from functools import wraps
 from itertools import groupby
@@ -67,38 +67,36 @@ def with_common_options(function: Callable[..., Any]) -> Callable[..., Any]:
         quiet, verbose, _ = given.pop("quiet"), given.pop("verbose"), given.pop("config")
         with output.loudness(quiet=quiet, verbose=verbose):
             output.detail(", ".join(f"{k.rstrip('_')}={v}" for k, v in given.items() if isinstance(v, _PLAIN)))
-            for name, group in groups.items():
-                given[name] = _made(group, given)
-            return function(**given)
+            return _called(function, given)
 
-    hints = get_type_hints(function, include_extras=True)
-    groups: dict[str, Any] = {name: kind for name, kind in hints.items() if is_dataclass(kind)}
-    own: list[inspect.Parameter] = []
-    for name, p in inspect.signature(function).parameters.items():
-        own += _options(groups[name]) if name in groups else [_option(name, hints[name], p.default)]
-    more = [_option(name, kind, default) for name, (kind, default) in _OPTIONS.items()]
-    command.__signature__ = inspect.Signature([*own, *more])  # type: ignore[attr-defined]
-    command.__annotations__ = {p.name: p.annotation for p in (*own, *more)}
+    options = [*_options(function), *(_option(name, kind, default) for name, (kind, default) in _OPTIONS.items())]
+    command.__signature__ = inspect.Signature(options)  # type: ignore[attr-defined]
+    command.__annotations__ = {p.name: p.annotation for p in options}
     return command
 
 
-def _options(group: Any) -> Iterator[inspect.Parameter]:
-    """Of the fields of a dataclass that have a help, and of those of dataclasses in it."""
-    for name, kind, default in _asked(group):
+def _options(asking: Any) -> Iterator[inspect.Parameter]:
+    """Of a command, or a dataclass of settings, and of the dataclasses in it."""
+    for name, kind, default in _asked(asking):
         yield from _options(kind) if is_dataclass(kind) else [_option(name, kind, default)]
 
 
-def _made(group: Any, given: dict[str, Any]) -> Any:
-    asked = _asked(group)
-    return group(**{name: _made(kind, given) if is_dataclass(kind) else given.pop(name) for name, kind, _ in asked})
+def _called(asking: Any, given: dict[str, Any]) -> Any:
+    """What comes of a command, or a dataclass, with the options that were given."""
+    asked = _asked(asking)
+    return asking(**{name: _called(kind, given) if is_dataclass(kind) else given[name] for name, kind, _ in asked})
 
 
-def _asked(group: Any) -> list[tuple[str, Any, Any]]:
-    hints = get_type_hints(group, include_extras=True)
-    found = [
-        (f.name, hints[f.name], inspect.Parameter.empty if f.default is MISSING else f.default) for f in fields(group)
+def _asked(asking: Any) -> list[tuple[str, Any, Any]]:
+    """Name, type and default of each parameter that has a help or such parameters of its own, and of typer's context:
+    no other field of a dataclass is an option."""
+    hints = get_type_hints(asking, include_extras=True)
+    found = [(name, hints[name], p.default) for name, p in inspect.signature(asking).parameters.items()]
+    return [
+        (name, kind, default)
+        for name, kind, default in found
+        if hasattr(kind, "__metadata__") or is_dataclass(kind) or kind is typer.Context
     ]
-    return [(name, kind, d) for name, kind, d in found if hasattr(kind, "__metadata__") or is_dataclass(kind)]
 
 
 def _option(name: str, kind: Any, default: Any) -> inspect.Parameter:
