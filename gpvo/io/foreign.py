@@ -346,34 +346,28 @@ def _read_bag(path: Path, topic: str | None, axes: str, complete: bool) -> Forei
             found = ", ".join(wanted) or "none"
             raise SourceError(f"which topic? (poses on: {found})", where=path, cure="name one with --topic")
         topic = wanted[0]
-    return replace(_read_bag_topic(path, topic, axes, complete), other_topics=tuple(t for t in poses if t != topic))
-
-
-def _read_bag_topic(path: Path, topic: str, axes: str, complete: bool) -> ForeignLog:
     notes: list[str] = []
     t, T, read = read_poses(path, topic, notes.append, complete=complete)
     frame, child = moving_frame(read[0]), frame_name(getattr(read[0], "child_frame_id", ""))
-    log = ForeignLog(path, Trajectory(t, T), notes=tuple(notes), topic=topic, frame_id=frame)
+    others = tuple(name for name in poses if name != topic)
+    log = ForeignLog(path, Trajectory(t, T), topic=topic, frame_id=frame, other_topics=others)
     if child and not is_optical(child):
         log = replace(log, body=printable(child[:256]))
     stated = (covariances_of(read, name) for name in ("twist", "pose"))
     twist, pose = (None if C is None else np.where(np.isfinite(C), C, np.nan) for C in stated)
     still = still_axes(T)
-    if pose is not None:
-        notes += other_axes(T, pose, axes)
-        pose = definite_in_plane(into_body(T, pose, axes), still)
     twist = None if twist is None else definite_in_plane(twist, still)
+    remarks = [] if pose is None else other_axes(T, pose, axes)
+    pose = None if pose is None else definite_in_plane(into_body(T, pose, axes), still)
+    of_poses = pose is not None and _looks_stated(pose)
     if twist is not None and _looks_stated(twist):
         # Of the velocity in the child frame over the step that ends at the stamp.
         dt = np.concatenate([[np.nan], np.diff(t) * 1e-9])
-        if pose is not None and _looks_stated(pose):
-            notes.append("the covariances of its velocities are used, those of its poses are not")
+        notes += ["the covariances of its velocities are used, those of its poses are not"] * of_poses
         return replace(log, covariance=twist * dt[:, None, None] ** 2, notes=tuple(notes))
-    if pose is None:
-        return log
-    if _looks_stated(pose):
-        return replace(log, covariance=pose, covariance_of="pose")
-    return replace(log, notes=(*notes, NONE_STATED))
+    if of_poses:
+        return replace(log, covariance=pose, covariance_of="pose", notes=(*notes, *remarks))
+    return replace(log, notes=(*notes, *([] if pose is None else [NONE_STATED])))
 
 
 def _looks_stated(covariance: Array) -> bool:

@@ -12,7 +12,7 @@ import pytest
 import sequences as seq
 from bag_maker import BagMaker, stereo_bag
 from gpvo.errors import CalibrationError, SourceError
-from gpvo.geometry import se3
+from gpvo.geometry import covariance, se3
 from gpvo.io import guess, open_source
 from gpvo.io.bag_messages import decode_message, pair_streams, pose_of
 from gpvo.io.bag_reader import stamp_ns
@@ -617,6 +617,19 @@ def test_odometry_of_others(tmp_path, kind):
     expected = np.array([1e-4, 2e-4, 3e-4, 1e-6, 2e-6, 3e-6]) * 0.05**2
     np.testing.assert_allclose(np.diag(records[3].covariances["imported"]), expected, rtol=1e-9)
     assert not records[0].covariances
+
+
+def test_covariances_of_poses_that_grow_in_other_axes_than_read_are_remarked(tmp_path):
+    """The remark was made, and left behind."""
+    C, T, maker = 1e-10 * np.eye(6), seq.true_poses(20), BagMaker(False)
+    for k, t in enumerate(seq.stamps(20)):
+        if k:
+            added = np.diag([1e-4 if k < 4 else 1e-8, 1e-8, 1e-8, 1e-10, 1e-10, 1e-10])
+            C = covariance.compound(se3.inverse(T[k - 1]) @ T[k], C, added)
+        maker.pose_with_covariance("/pose", t, T[k], C)
+    path = maker.write(tmp_path / "bag")
+    assert not read_foreign(path, covariance_axes="body").notes
+    assert "--covariance-axes body" in read_foreign(path).notes[0]
 
 
 @pytest.mark.parametrize("axes", ["auto", "world", "body", "mixed"])
