@@ -136,14 +136,13 @@ def options_of_file(path: Path, name: str, commands: Mapping[str, Any]) -> list[
             near = get_close_matches(key.replace("-", "_"), known, 1)
             cure = f"did you mean {near[0]}?" if near else f"gpvo {name} --help lists them"
             raise GpvoError(f"[{name}] has no option '{key}'", where=path, cure=cure)
-        if option.is_flag and not isinstance(value, bool):
-            raise GpvoError(f"[{name}] {key} is {value!r}", where=path, cure="give true or false")
+        kinds, cure = (bool, "give true or false") if option.is_flag else ((str, int, float), "give text or a number")
+        values = value if isinstance(value, list) and not option.is_flag else [value]
+        if not all(isinstance(v, kinds) for v in values):
+            raise GpvoError(f"[{name}] {key} is {value!r}", where=path, cure=cure)
         if option.is_flag:
             words += [option.opts[0]] if value else option.secondary_opts[:1]
             continue
-        values = value if isinstance(value, list) else [value]
-        if not all(isinstance(v, (str, int, float)) for v in values):
-            raise GpvoError(f"[{name}] {key} is {value!r}", where=path, cure="give text or a number")
         texts = [str(v) for v in values]
         try:
             for text in texts:

@@ -207,13 +207,15 @@ def _vehicle_of(meta: dict[str, Any], path: Path) -> Vehicle:
 
 @contextmanager
 def _guarded(path: Path) -> Iterator[None]:
-    """Turns a missing or malformed column into one line."""
+    """Turns a missing or malformed column, or a camera that cannot be, into one line."""
     try:
         yield
     except KeyError as error:
         raise SourceError(f"lacks the column {error}", where=path, cure="was it made by gpvo?") from None
     except (AttributeError, ValueError, TypeError, OverflowError) as error:
         raise SourceError(f"is malformed: {error}", where=path) from None
+    except CalibrationError as problem:
+        raise SourceError(problem.what, where=path) from None
 
 
 def table_of(kind: str) -> str:
@@ -291,16 +293,13 @@ def _read_rig(path: Path) -> tuple[StereoCamera | None, Mounting]:
         _check_poses(T[None], path)
         return T
 
-    try:
-        with _guarded(path):
-            raw = document.get("camera")
-            camera = None if raw is None else StereoCamera(**{k: raw[k] for k in field_names(StereoCamera)})
-            body = document.get("body", "base_link")
-            if not (isinstance(body, str) and 0 < len(body) <= 256):
-                raise ValueError("body is not the name of a frame")
-            return camera, Mounting(pose("T_body_cam"), pose("T_imu_cam"), printable(body))
-    except CalibrationError as problem:
-        raise SourceError(problem.what, where=path) from None
+    with _guarded(path):
+        raw = document.get("camera")
+        camera = None if raw is None else StereoCamera(**{k: raw[k] for k in field_names(StereoCamera)})
+        body = document.get("body", "base_link")
+        if not (isinstance(body, str) and 0 < len(body) <= 256):
+            raise ValueError("body is not the name of a frame")
+        return camera, Mounting(pose("T_body_cam"), pose("T_imu_cam"), printable(body))
 
 
 def _read_truth(path: Path) -> TruthLog | None:
