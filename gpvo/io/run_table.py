@@ -10,7 +10,6 @@ from __future__ import annotations
 
 import re
 from collections.abc import Callable, Iterable, Mapping, Sequence
-from dataclasses import fields
 from itertools import chain
 from typing import Any
 
@@ -25,7 +24,6 @@ from gpvo.types import (
     IMU_FIELDS,
     Array,
     ImuLog,
-    MotionError,
     Prediction,
     Status,
     StereoTracks,
@@ -144,9 +142,8 @@ def prediction_columns(predictions: Iterable[Prediction]) -> Columns:
     ``cov_bias`` is all that persists. Of models with errors of calibration, ``root_calibration_<i><j>`` and
     ``calibration_tau_*_s`` besides; ``nu`` where the tails are heavier than a Gaussian's.
     """
-    of = StoredPredictions.of(predictions).columns
-    told: dict[str, Any] = {f.name: of[f.name] for f in fields(MotionError) if f.name not in ("status", "nu")}
-    errors = MotionError(**told)
+    stored = StoredPredictions.of(predictions)
+    of, errors = stored.columns, stored.batch(slice(None))
     out: Columns = {name: of[name] for name in ("t_ns", "dt_s")}
     out["status"] = [status.value for status in of["status"]]
     out |= {name: of[name] for name in ("confidence", "in_domain")}

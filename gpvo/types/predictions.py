@@ -153,7 +153,7 @@ class StoredPredictions(Columns[Prediction]):
         of_one = {name: column.item(k) if column.ndim == 1 else column[k] for name, column in self.columns.items()}
         return Prediction(**of_one)
 
-    def batch(self, rows: NDArray[np.int64]) -> MotionError:
+    def batch(self, rows: NDArray[np.int64] | slice) -> MotionError:
         """Some of them as one, of one time constant each and of no status."""
         names = ("mean", "jitter", "white", "persistent_root", "persistent_tau_s", "dt_s")
         of: dict[str, Any] = {name: self.columns[name][rows] for name in names}
