@@ -227,7 +227,8 @@ def make_twins(
     Raises SourceError as :func:`estimate`, and where the folder holds twins that these would not replace.
     """
     made = range(settings.replicates)
-    others = (p for p in sorted(out.glob("*-twin*/")) if p.name.rpartition("-twin")[2] not in map(str, made))
+    # One that begins with a dot was to replace a finished twin when the process was killed; the new one clears it.
+    others = (p for p in sorted(out.glob("[!.]*-twin*/")) if p.name.rpartition("-twin")[2] not in map(str, made))
     if (other := next(others, None)) is not None:
         cure = "remove it, make as many as before, or give another folder"
         raise SourceError(f"is a twin that {settings.replicates} replicates would not replace", where=other, cure=cure)

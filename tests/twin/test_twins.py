@@ -296,6 +296,8 @@ def test_twins_of_an_earlier_call_do_not_stay_among_those_of_this(blind, tmp_pat
     gpvo("twin", blind, "-o", tmp_path / "t", "--replicates", 3)
     with pytest.raises(SourceError, match="blind-twin2: is a twin that 2 replicates would not replace"):
         gpvo("twin", blind, "-o", tmp_path / "t", "--replicates", 2)
+    # As a process leaves it that is killed while it replaces a twin.
+    (tmp_path / "t" / "blind" / ".blind-twin0.new").mkdir()
     assert gpvo("twin", blind, "-o", tmp_path / "t", "--replicates", 3).exit_code == 0
 
 
