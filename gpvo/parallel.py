@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import os
 import signal
+import threading
+import time
 import warnings
 from collections import deque
 from collections.abc import Callable, Generator, Iterable, Iterator, Sequence
@@ -15,6 +17,7 @@ from typing import Any, TypeVar
 from gpvo.errors import GpvoError, require
 
 T = TypeVar("T")
+_WATCH_S = 0.5
 _KILLED = "a worker process was killed, as when memory runs out"
 
 
@@ -66,12 +69,24 @@ def map_jobs(
     with warnings.catch_warnings():
         # A process that has grown is renewed between two jobs: nothing is lost, and nothing is to be done about it.
         warnings.filterwarnings("ignore", "A worker stopped while some jobs", UserWarning)
-        # Ctrl-C reaches workers too; this process alone heeds it, and ends them.
-        deaf = {"initializer": signal.signal, "initargs": (signal.SIGINT, signal.SIG_IGN)}
+        bound = {"initializer": _serve, "initargs": (os.getpid(),)}
         try:
-            return _told(Parallel(n_jobs=jobs, return_as="generator", **deaf)(calls), on_done)
+            return _told(Parallel(n_jobs=jobs, return_as="generator", **bound)(calls), on_done)
         except BrokenProcessPool:
             raise GpvoError(_KILLED, cure="run it again, with fewer --jobs") from None
+
+
+def _serve(master: int) -> None:
+    """Bind a worker to the process that made it. Ctrl-C reaches workers too, but the master alone heeds it, and ends
+    them; where it is killed itself, they end instead of going on to write, and then waiting for minutes."""
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
+
+    def watch() -> None:
+        while os.getppid() == master:
+            time.sleep(_WATCH_S)
+        os._exit(1)
+
+    threading.Thread(target=watch, daemon=True).start()
 
 
 def _told(results: Iterable[Any], on_done: Callable[[], None]) -> list[Any]:

@@ -141,16 +141,19 @@ def flights(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return folder
 
 
-def test_sigterm_ends_the_workers_too(tmp_path: Path) -> None:
-    """As of a service manager or a batch system: nothing goes on to write after the command has ended."""
+@pytest.mark.parametrize("how", [signal.SIGTERM, signal.SIGKILL], ids=lambda how: how.name)
+def test_what_ends_a_command_ends_its_workers_too(how: signal.Signals, tmp_path: Path) -> None:
+    """As of a service manager, a batch system or the kernel where memory runs out: nothing goes on to write after the
+    command has ended."""
     short = ("--points", "--duration", 5, "--seeds", "0..9999")
     call = start(*GPVO, "simulate", "tunnel-clean", *short, "--jobs", 2, "-o", tmp_path)
     deadline = time.monotonic() + 120
     while not list(tmp_path.glob("*.npz")) and time.monotonic() < deadline:
         time.sleep(0.05)
-    os.kill(call.pid, signal.SIGTERM)
+    os.kill(call.pid, how)
     _, err = call.communicate(timeout=60)
-    assert (call.returncode, err) == (128 + signal.SIGTERM, b"")
+    ends = {signal.SIGTERM: (128 + signal.SIGTERM, b""), signal.SIGKILL: (-signal.SIGKILL, b"")}
+    assert (call.returncode, err) == ends[how]
     for _ in range(100):
         try:
             os.killpg(call.pid, 0)
