@@ -27,6 +27,7 @@ _WRITTEN = {"onnx": b"\x12\x04gpvo", "c": b"written by gpvo"}  # near the top, o
 PREFIX = "gpvo"
 """Of every symbol, unless another is asked for."""
 _PER_LINE = 8
+_LASTING = ("bias_tau_s", "calibration_tau_s")
 _NAME = re.compile(r"[A-Za-z][A-Za-z0-9_]*")
 # Of C23 and C++, so that a header compiles in either.
 _KEYWORDS = (
@@ -71,8 +72,15 @@ def export_model(model: Path, path: Path, to: str, *, prefix: str = PREFIX) -> N
         to_c(predictor.model, path, name=prefix, units=units, note=note)
     else:
         metadata = {"digest": predictor.digest, "units": ",".join(units), "target": predictor.target}
-        metadata["nu"] = f"{float(predictor.model.nu[0]):g}"
-        to_onnx(predictor.model, path, metadata=metadata)
+        errors = predictor.model
+        metadata |= {"nu": f"{float(errors.nu[0]):g}", "geometry": _geometry(errors)}
+        metadata |= {name: ",".join(map(repr, getattr(errors.division, name).tolist())) for name in _LASTING}
+        to_onnx(errors, path, metadata=metadata)
+
+
+def _geometry(model: ErrorModel) -> str:
+    """The method whose covariances it takes for the correlations, empty where it makes no use of any."""
+    return (model.base.method or "") if model.division.geometry_weight[0] > 0 else ""
 
 
 def to_c(model: ErrorModel, path: Path, *, name: str = PREFIX, units: tuple[str, ...] = (), note: str = "") -> None:
@@ -93,7 +101,7 @@ def to_c(model: ErrorModel, path: Path, *, name: str = PREFIX, units: tuple[str,
 
 
 def _preamble(model: ErrorModel, units: tuple[str, ...], note: str) -> list[str]:
-    units = units or ("",) * len(model.columns)
+    units, method = units or ("",) * len(model.columns), _geometry(model)
     features = [
         f" *  {i:3d}  {_comment(c)} {f'[{_comment(u)}]' if u else ''}".rstrip()
         for i, (c, u) in enumerate(zip(model.columns, units))
@@ -104,6 +112,8 @@ def _preamble(model: ErrorModel, units: tuple[str, ...], note: str) -> list[str]
         " *",
         " * Features, in order; their formulas: docs/concepts/features.rst of gpvo.",
         *features,
+        " *",
+        f" * Geometry: {f'the covariance by {_comment(method)}' if method else 'not used'}.",
         " */",
         "#ifndef GPVO_MODEL_H",
         "#define GPVO_MODEL_H",
@@ -141,6 +151,7 @@ def _constants(model: ErrorModel) -> list[str]:
         "SHORTEST_S": _number(DURATIONS_S[0]),
         "LONGEST_S": _number(DURATIONS_S[1]),
         "NU": _number(model.nu[0]),
+        **{n.upper(): f"{{{', '.join(map(_number, getattr(model.division, n)))}}}" for n in _LASTING},
     }
     return [
         *(f"#define GPVO_{key} {value}" for key, value in sizes.items()),

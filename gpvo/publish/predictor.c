@@ -11,8 +11,9 @@ typedef struct {
     double covariance[36]; /* total, about the mean */
     double jitter[36];     /* the three parts it is the sum of */
     double white[36];
-    double bias[36];
-    double calibration_root[36]; /* L: of the bias, L L^T is what a wrong calibration makes */
+    double bias[36];             /* time constants of its axes: GPVO_BIAS_TAU_S, but for what the next one makes */
+    double calibration_root[36]; /* L: of the bias, L L^T is what a wrong calibration makes; its columns change sign with
+                                  * the motion, and last for GPVO_CALIBRATION_TAU_S */
     double epistemic[6]; /* share of each variance that comes from being away from the training data */
     double in_domain;    /* 0..1 */
     double confidence;   /* 0..1 */
@@ -201,7 +202,7 @@ static void gpvo_divide(int j, double variance, double faster, double part[3][6]
 
 /* The error of one motion that was measured. One that odometry lost, or that no vehicle can make, is a guess whose error is
  * far larger than this says, as it depends on how fast the vehicle was: leave it out. features: GPVO_N_FEATURES values in the
- * order above, NAN where missing. geometry: 6x6 covariance by the model's geometric method for the correlations, or NULL. dt_s:
+ * order above, NAN where missing. geometry: 6x6 covariance by the method named above for the correlations, or NULL. dt_s:
  * duration of the motion; what is none, such as 0, means the training's. Never fails; uses no heap and no state. */
 static inline void gpvo_predict(const double *features, const double *geometry, double dt_s, gpvo_estimate *out) {
     double inside[GPVO_N_FEATURES], inputs[GPVO_N_INPUTS], ratio[6], spread[6], base[6], plain[6], R[3][36], part[3][6], limit[2], distance, outside, growth;

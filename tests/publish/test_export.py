@@ -282,6 +282,22 @@ def test_onnx_has_no_prefix(tmp_path: Path) -> None:
         export_model(tmp_path / "model", tmp_path / "out", "onnx", prefix="mine")
 
 
+def test_exports_name_the_geometry_that_they_take_and_how_long_errors_last(tmp_path: Path) -> None:
+    """Columns of several geometric methods may be among the features; a filter needs the time constants."""
+    for case, words in (("of conditions", "the covariance by triangulation."), ("no geometry", "not used.")):
+        to_c(CASES[case], tmp_path / "model.h")
+        assert f" * Geometry: {words}\n" in (tmp_path / "model.h").read_text()
+    assert "#define GPVO_BIAS_TAU_S {1.0, 1.0, 1.0, 1.0, 1.0, 1.0}\n" in (tmp_path / "model.h").read_text()
+    onnx = pytest.importorskip("onnx")
+    trained, model = small_model(), tmp_path / "errors.gpvo"
+    modelfile.save(model, trained.arrays, trained.header)
+    export_model(model, tmp_path / "model.onnx", "onnx")
+    told = {p.key: p.value for p in onnx.load(str(tmp_path / "model.onnx")).metadata_props}
+    assert told["geometry"] == (trained.header["base_method"] if trained.arrays["geometry_weight"][0] > 0 else "")
+    for name in ("bias_tau_s", "calibration_tau_s"):
+        assert [float(v) for v in told[name].split(",")] == trained.arrays[name].tolist()
+
+
 def test_c_names_must_be_identifiers(tmp_path: Path) -> None:
     with pytest.raises(GpvoError, match="not a C identifier"):
         to_c(CASES["of conditions"], tmp_path / "model.h", name="1+1")
