@@ -27,6 +27,7 @@ from gpvo.vo.rivals import cells
 
 _FEATURES = 2000  # of an image that is matched afresh
 _MOST_DEFORMED = 0.5  # of a patch, over its size: beyond, it is no longer the same picture
+_LEVEL: Array = np.empty((0, 2))  # slopes of the disparity where nothing is known of any
 
 
 @dataclass(frozen=True)
@@ -102,12 +103,6 @@ class _New:
     detected: int
     seen: _Seen
     strong: int
-
-    @classmethod
-    def of(cls, detected: int, found: _Found, known: int) -> _New:
-        """What the search came to after the ``known`` points; of the new ones ``detected`` are the image's best."""
-        seen, good = found.seen[known:], found.good[known:]
-        return cls(detected, seen[good], int(good[:detected].sum()))
 
 
 class KltFrontend:
@@ -201,7 +196,10 @@ class KltFrontend:
         if inliers is None:
             self._matched, self._new = self._nothing, None
             inliers = np.zeros(0, bool)
-        kept, new = self._matched[inliers], self._new or self._new_beside(current, self._matched.left_uv)
+        if self._new is None:
+            self._with_new_corners(current, self._nothing.left_uv, np.empty(0), taken_uv=self._matched.left_uv)
+        kept, new = self._matched[inliers], self._new
+        assert new is not None
         current.seen = kept + new.seen
         current.strong = len(kept) + new.strong
         if current.strong >= at_least:
@@ -275,32 +273,26 @@ class KltFrontend:
         chosen, first = np.unique(cell, return_index=True)
         return uv[first[~np.isin(chosen, taken)]]
 
-    def _with_new_corners(self, view: _View, uv: Points, disparity: Array, slope: Array) -> _Found:
-        """One search in the right image for both known points of the left one and the new corners between them: as
-        :meth:`_find_right`, the known points first."""
-        new_uv, new_disparity, detected = self._new_corners(view, uv)
-        found = self._find_right(
-            view,
-            np.concatenate([uv, new_uv]),
-            np.concatenate([disparity, new_disparity]),
-            np.concatenate([slope, np.zeros((len(new_uv), 2))]),
-        )
-        self._new = _New.of(detected, found, len(uv))
+    def _with_new_corners(
+        self, view: _View, uv: Points, disparity: Array, slope: Array = _LEVEL, taken_uv: Points | None = None
+    ) -> _Found:
+        """One search in the right image for points of the left one and for new corners between them, or between those
+        ``taken_uv`` (M, 2), which are measured already: as :meth:`_find_right`, the new corners last."""
+        new_uv, new_disparity, detected = self._new_corners(view, uv if taken_uv is None else taken_uv)
+        found = self._find_right(view, np.concatenate([uv, new_uv]), np.concatenate([disparity, new_disparity]), slope)
+        seen, good = found.seen[len(uv) :], found.good[len(uv) :]
+        self._new = _New(detected, seen[good], int(good[:detected].sum()))
         return found
 
-    def _new_beside(self, view: _View, taken_uv: Points) -> _New:
-        """New corners between those taken (N, 2), which are measured already."""
-        uv, disparity, detected = self._new_corners(view, taken_uv)
-        return _New.of(detected, self._find_right(view, uv, disparity, np.zeros((len(uv), 2))), 0)
-
-    def _find_right(self, view: _View, uv_left: Points, disparity: Array, slope: Array) -> _Found:
-        """Points (N, 2) of the left image sought in the right one, from a guessed disparity (N,) and slope (N, 2)."""
+    def _find_right(self, view: _View, uv_left: Points, disparity: Array, slope: Array = _LEVEL) -> _Found:
+        """Points (N, 2) of the left image sought in the right one, from a guessed disparity (N,) and, of the first n,
+        its slope (n, 2)."""
         config = self._config
         guess = np.column_stack([uv_left[:, 0] - disparity, uv_left[:, 1]])
         window_px = config.klt_window_px
         uv_right, found = opencv.track(view.left, view.right_as_left, uv_left, guess, window_px, 2)
         A = np.tile(np.eye(2), (len(uv_left), 1, 1))
-        A[:, 0] -= slope
+        A[: len(slope), 0] -= slope
         patches = cut(view.left, uv_left, window_px)
         near = align(patches, view.right_as_left, uv_right, A)
         uv_right = np.where(near.alike[:, None], near.uv, uv_right)
@@ -349,9 +341,9 @@ class KltFrontend:
         (from_uv, from_bits), (to_uv, to_bits) = self._features(reference), self._features(current)
         pairs = opencv.match_mutual(from_bits, to_bits)
         uv, disparity = self._rough(reference, from_uv[pairs[:, 0]])
-        before = self._find_right(reference, uv, disparity, np.zeros((len(uv), 2)))
+        before = self._find_right(reference, uv, disparity)
         uv, disparity = self._rough(current, to_uv[pairs[:, 1]])
-        now = self._with_new_corners(current, uv, disparity, np.zeros((len(uv), 2)))
+        now = self._with_new_corners(current, uv, disparity)
         n = len(uv)
         good = before.good & now.good[:n]
         self._matched = now.seen[:n][good]
