@@ -52,8 +52,8 @@ def train(
 ) -> None:
     """Train an error model; score it by leaving each run out.
 
-    Of more than 24 runs, a 24th is left out at a time. Interrupted training resumes from its finished folds when started
-    again.
+    Of more than 24 runs, a 24th is left out at a time. Interrupted training resumes from its finished folds when
+    started again.
 
     Example: gpvo train runs/a runs/b runs/c -o errors.gpvo
     """
