@@ -24,7 +24,7 @@ from gpvo.io.foreign_csv import NO_HEADER
 from gpvo.io.run import Run, copy_run, read_run, write_run
 from gpvo.io.run_read import is_run
 from gpvo.io.stated import to_records
-from gpvo.io.trajectory import check_overlap
+from gpvo.io.trajectory import UNKNOWN, carry, check_overlap
 from gpvo.online.slip import flag_slips
 from gpvo.types import Mounting, TruthLog, Vehicle, VoLog
 
@@ -87,16 +87,14 @@ def import_log(
     held, place = held_poses(log.t_ns, log.trajectory.T_world_body), PLACES[frame]
     if truth is not None:
         check_same_rows(truth, log)
-    log, given = (log.rows(~held) if held.any() else log).seen_from(place), None
-    if truth is not None:
-        sigma = truth_sigma or (0.0, 0.0)
-        given = TruthLog(truth.t_ns, truth.seen_from(place).trajectory.T_world_body, *sigma)
+    log = log.rows(~held).seen_from(place)
+    given = None if truth is None else carry(truth.trajectory, place, truth_sigma or UNKNOWN)
     if time_offset_s is None:
         if given is None:
             raise SourceError("a time offset can only be estimated against ground truth", cure="give --truth")
         time_offset_s = estimate_time_offset(VoLog(to_records(log)[0]), given)
-    log = log.shifted(time_offset_s) if time_offset_s else log
-    records, notes = to_records(log)
+    records, notes = to_records(log.shifted(time_offset_s))
+    made = VoLog(records)
     if held.any():
         notes.append(
             f"left out: {held.sum()} of {len(held)} poses, which only repeat the one before while the vehicle moves, as"
@@ -108,18 +106,18 @@ def import_log(
         notes.append(f"poses on {unread} are not used: --topic takes them as the odometry, --truth-topic as truth")
     fixed: FixedTransform | None = None
     if given is not None and truth is not None:
-        given, fixed = _fitted(VoLog(records), given, truth.path, align)
+        given, fixed = _fitted(made, given, truth.path, align)
     meta: dict[str, Any] = {"source": log.path.name, "format": "import", "kind": "import"}
     write_run(
         out,
-        VoLog(records),
+        made,
         overwrite=overwrite,
         truth=given,
         mounting=_mounting(log, frame),
         config={"import": {"frame": frame, "align": align, "time_offset_s": time_offset_s}},
         meta=meta | {"notes": notes, "vehicle": asdict(vehicle or Vehicle())},
     )
-    return _summary(VoLog(records), given, time_offset_s, fixed, notes)
+    return _summary(made, given, time_offset_s, fixed, notes)
 
 
 def add_truth(
