@@ -32,8 +32,8 @@ class Episode:
     cause: str
 
 
-# Factors on (pixel noise, number of tracks, outliers) where no images are drawn: error grows with noise and with the
-# root of the number, and its standard deviation about tenfold.
+# Factors on (pixel noise, number of tracks, outliers) where no images are drawn. Error grows with noise and falls with
+# the root of the number: together they raise its standard deviation about tenfold.
 CAUSES: dict[str, tuple[float, float, float]] = {
     "darkness": (2.8, 0.22, 3.0),
     "dust": (2.6, 0.20, 4.0),
