@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -208,12 +209,8 @@ class StereoOdometry:
         off_px = np.abs(np.concatenate([b - a for a, b in zip(before, now, strict=True)])).mean(axis=0)
         if off_px.max() < _SAME * scale_px:
             return matches, motion
-        refined = refine(motion.T_prev_cur, *now, self.camera, noise=motion.noise, chosen_px=scale_px)
-        if refined is None:
-            return matches, motion
-        inliers = np.zeros(len(among), bool)
-        inliers[among] = refined.inliers
-        return again, replace(refined, inliers=inliers)
+        refined = self._refined(motion.T_prev_cur, again, among, noise=motion.noise, chosen_px=scale_px)
+        return (matches, motion) if refined is None else (again, refined)
 
     def _choose(
         self, matches: Matches, motion: Motion | None, t_ns: int, doubts: list[str]
@@ -286,8 +283,11 @@ class StereoOdometry:
         T_prev_cur, tolerance_px = se3.inverse(found), 2 * near_px
         if (among & agrees(T_prev_cur, matches, camera, tolerance_px)).sum() < config.min_inliers:
             return None
-        uvd_prev, uvd_cur = matches.uvd_prev[among], matches.uvd_cur[among]
-        motion = refine(T_prev_cur, uvd_prev, uvd_cur, camera, noise=self._noise.value, tolerance_px=tolerance_px)
+        return self._refined(T_prev_cur, matches, among, noise=self._noise.value, tolerance_px=tolerance_px)
+
+    def _refined(self, T_start: Array, matches: Matches, among: NDArray[np.bool_], **how: Any) -> Motion | None:
+        """The motion of the points ``among`` (N,), as of :func:`refine`; its inliers are of all (N,)."""
+        motion = refine(T_start, matches.uvd_prev[among], matches.uvd_cur[among], self.camera, **how)
         if motion is None:
             return None
         inliers = np.zeros(len(among), bool)
