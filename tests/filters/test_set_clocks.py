@@ -5,7 +5,7 @@ from __future__ import annotations
 import copy
 from dataclasses import replace
 from functools import cache
-from itertools import product
+from itertools import pairwise, product
 
 import numpy as np
 import pytest
@@ -153,3 +153,26 @@ def test_a_record_sent_twice_or_late_starts_no_rival() -> None:
     assert timeline.counts["clock_set_back"] == 0
     assert timeline.counts["repeated"] == 2
     _ends_alike(timeline, _usual(5))
+
+
+def test_late_records_by_the_clock_of_before_are_left_out() -> None:
+    """All clocks are set back by eight seconds, and records come two frames after their samples: the last two by the
+    clock of before, taken for ones to come, left the filter 5.3 m off after ten seconds, instead of 0.2."""
+    (flight, _, begin_ns), timeline = _flight(5), _timeline(_flight(5)[0])
+    imu, records, late = flight.imu, flight.records, 2
+    assert imu is not None
+
+    def stamp(t_ns: int) -> int:
+        return t_ns - 8 * 10**9 * (t_ns >= begin_ns)
+
+    came = [0, *np.searchsorted(imu.t_ns, [r.t_ns for r in records], side="right")]
+    for k, (first, last) in enumerate(pairwise(came)):
+        for i in range(first, last):
+            timeline.add_imu(stamp(int(imu.t_ns[i])), imu.gyro_radps[i], imu.acc_mps2[i])
+        if k >= late:
+            r = records[k - late]
+            told = replace(r, t_ns=stamp(r.t_ns), t_prev_ns=stamp(r.t_prev_ns))
+            timeline.add_vo(told, flight.predictions.get(r.t_ns))
+    found, usual = (np.trace(t.filter.covariance[0, P, P]) for t in (timeline, _usual(5)))
+    assert found < 1.5 * usual
+    assert timeline.counts["silences"] == 0
