@@ -41,6 +41,8 @@ def score(
         raise SourceError("no such file or folder", where=missing[0])
     options = JudgeOptions(truth_sigma=truth_sigma).options()
     if len(stated) == 1 and stated[0].is_dir() and not truth:
+        if out is not None and out.resolve().parent == stated[0].resolve():
+            raise GpvoError("lies where a method would", where=out, cure="write the scores to a folder beside these")
         with progress("folders", 1):
             methods = score_folder(stated[0], options)
         if out is not None:
@@ -63,7 +65,7 @@ _LEGEND = "E: energy score, lower is better. NEES: per motion, then over 1 s, 10
 
 
 def _print_board(methods: dict[str, dict[str, Any]], exact: bool) -> None:
-    from gpvo.evaluation.score import board, on_other_axes
+    from gpvo.evaluation.score import board, on_other_axes, with_fewer_motions
 
     head = ("method", "E [mm]", "[mrad]", "NLL", "NEES", "1 s", "10 m", "100 m", "easy", "hard")
     rows = zip(*board(methods).values())  # NEES and shares to two digits: the table fits 80 columns
@@ -74,6 +76,8 @@ def _print_board(methods: dict[str, dict[str, Any]], exact: bool) -> None:
         say(_EXACT)
     for method, axes in on_other_axes(methods).items():
         say(f"{method}: NLL and NEES are of {', '.join(axes)} alone: not comparable with those of others.")
+    for method, (sequence, own, most) in with_fewer_motions(methods).items():
+        say(f"{method}: states {own} motions of {sequence}, others {most}: not comparable, as the rest is not scored.")
 
 
 def _print(found: dict[str, Any], exact: bool) -> None:

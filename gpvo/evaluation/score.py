@@ -36,6 +36,8 @@ if TYPE_CHECKING:
 POOLED = ("energy_translation_m", "energy_rotation_rad", "nll_per_dim", "nees_dof", "correlation_gain_nats")
 """Scores that are averaged over the sequences, with an interval by whole sequences."""
 
+_WHOLE = 0.95
+
 
 @dataclass(frozen=True)
 class SequenceScore:
@@ -139,7 +141,8 @@ def score_folder(folder: Path, options: EvaluateOptions | None = None) -> dict[s
         cure = "gpvo evaluate RUN --stated makes such folders"
         raise SourceError("holds no truth/SEQUENCE.txt", where=folder, cure=cure)
     found = {}
-    for method in sorted(p for p in folder.iterdir() if p.is_dir() and p.name != "truth"):
+    # A name that begins with a dot is some other tool's.
+    for method in sorted(p for p in folder.glob("[!.]*") if p.is_dir() and p.name != "truth"):
         pairs = [(_of_sequence(method, truth), truth) for truth in truths]
         found[method.name] = {"method": method.name, **score(pairs, options)}
     if not found:
@@ -196,6 +199,22 @@ def on_other_axes(found: Mapping[str, Mapping[str, Any]]) -> dict[str, tuple[str
             most[sequence] = max(most.get(sequence, ()), names, key=len)
     other = {m: [names for s, names in judged.items() if names != most[s]] for m, judged in axes.items()}
     return {method: min(names, key=len) for method, names in other.items() if names}
+
+
+def with_fewer_motions(found: Mapping[str, Mapping[str, Any]]) -> dict[str, tuple[str, int, int]]:
+    """Methods that state less than 95 % of the motions, lost ones included, that another states of a sequence: the
+    sequence of which they state the smallest share, how many there, and how many the other.
+
+    They break off, begin late, or leave frames out. What a file says nothing of, it is not charged for.
+    """
+    count = {m: {s["sequence"]: s["motions"] + s["lost"] for s in scores["sequences"]} for m, scores in found.items()}
+    out = {}
+    for method, own in count.items():
+        most = {name: max(of[name] for of in count.values() if name in of) for name in own}
+        worst = min(own, key=lambda name: own[name] / most[name])
+        if own[worst] < _WHOLE * most[worst]:
+            out[method] = worst, own[worst], most[worst]
+    return out
 
 
 def _mean_with(mean: float, count: int, charged: Array) -> float:

@@ -166,6 +166,24 @@ def test_axes_are_compared_sequence_by_sequence() -> None:
     assert on_other_axes({"a": of("xy", "xyz"), "b": of("xyz", "z")}) == {"a": ("x", "y"), "b": ("z",)}
 
 
+def test_a_method_that_breaks_off_is_not_compared_with_others(written, tmp_path: Path, capsys) -> None:
+    """It is charged for lost motions, but not for those that its file says nothing of: the easy ones alone are left."""
+    shutil.copytree(written[0], tmp_path / "board")
+    file = tmp_path / "board" / "triangulation" / "hall.txt"
+    shutil.copytree(file.parent, tmp_path / "board" / "whole")
+    (tmp_path / "board" / ".checkpoints").mkdir()
+    assert "not comparable" not in _call(capsys, tmp_path / "board")
+    lines = file.read_text().splitlines(keepends=True)
+    file.write_text("".join(lines[: len(lines) // 2]))
+    said = f"triangulation: states {len(lines) // 2 - 5} motions of hall, others {N}: not comparable"
+    assert said in _call(capsys, tmp_path / "board")
+
+
+def test_scores_are_not_written_where_the_next_call_takes_them_for_a_method(written, capsys) -> None:
+    with pytest.raises(GpvoError, match="results: lies where a method would"):
+        _call(capsys, written[0], "-o", written[0] / "results")
+
+
 def test_a_folder_without_methods_is_refused(written, tmp_path: Path) -> None:
     (tmp_path / "truth").mkdir()
     (tmp_path / "truth" / "a.txt").write_text("0 0 0 0 0 0 0 1\n1 0 0 1 0 0 0 1\n")
