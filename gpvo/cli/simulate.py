@@ -118,7 +118,7 @@ def _tell(scenario: Scenario, flights: list[Flight], json_: bool, preview: Path 
     lines = []
     for f in flights:
         what = f.error or f"{f.frames} frames, {f.distance_m:.1f} m" + ("" if f.redone else ", already there")
-        lines.append(f"{f.path}: {what}")
+        lines.append(what if what.startswith(f"{f.path}: ") else f"{f.path}: {what}")
     document = {"schema": 1, "scenario": scenario.name, "flights": [vars(f) for f in flights]}
     answer(json_, document, lambda: print(*lines, sep="\n"))
     if len(good) < len(flights):

@@ -87,6 +87,9 @@ def test_command(tmp_path):
     as_jpg = run(app, ["simulate", "tunnel", "--preview", str(tmp_path / "a.jpg")])
     assert "a.jpg: does not have the suffix of a PNG (end it in .png)" in str(as_jpg.exception)
     assert "nowhere to write" in str(run(app, ["simulate", "room-t265"]).exception)
+    (taken := tmp_path / "s" / "seed_3.npz").mkdir(parents=True)
+    refused = run(app, ["simulate", "tunnel", "--points", "--seeds", "3", "-o", str(taken.parent), "--duration", "5"])
+    assert refused.output.startswith(f"{taken}: is a folder")
 
 
 def test_a_worker_that_is_killed_is_one_line():
