@@ -10,7 +10,7 @@ And the records of another odometry's poses (:func:`to_records`): are its covari
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -31,7 +31,7 @@ from gpvo.geometry.covariance import (
 from gpvo.io.foreign import GROWING, NONE_STATED, ForeignLog, definite_in_plane, still_axes
 from gpvo.io.stamps import ns_to_seconds_text, seconds_text_to_ns, text_lines
 from gpvo.io.trajectory import Trajectory, read_tum_with, tum_line
-from gpvo.types import COUNT_FIELDS, IMPORTED, IMPORTED_POSE, Array, Status, VoLog, VoRecord
+from gpvo.types import COUNT_FIELDS, IMPORTED, IMPORTED_POSE, Array, Status, StoredRecords, VoLog, VoRecord
 
 GAP_STEPS = 10  # Logs of keyframes are irregular, but not by so much.
 UNKNOWN_RAD = 1.0
@@ -74,16 +74,19 @@ def read_stated(path: Path) -> VoLog:
     trajectory, rest = read_tum_with(path, behind)
     t_ns = trajectory.t_ns
     index = {int(t): k for k, t in enumerate(t_ns)}
-    records = [VoRecord(int(t_ns[0]), int(t_ns[0]), Status.START, np.eye(4))]
-    for k in range(1, len(t_ns)):
-        try:
-            start = k - 1 if behind == 21 else index.get(seconds_text_to_ns(rest[k][21]), k)
-        except ValueError as error:
-            raise SourceError(str(error), where=path) from None
-        if start >= k:
-            raise SourceError(f"the motion that ends at {rest[k][21]} s starts from no earlier frame", where=path)
-        records.append(_record(path, trajectory, start, k, rest[k][:21]))
-    return VoLog(records)
+
+    def records() -> Iterator[VoRecord]:
+        yield VoRecord(int(t_ns[0]), int(t_ns[0]), Status.START, np.eye(4))
+        for k in range(1, len(t_ns)):
+            try:
+                start = k - 1 if behind == 21 else index.get(seconds_text_to_ns(rest[k][21]), k)
+            except ValueError as error:
+                raise SourceError(str(error), where=path) from None
+            if start >= k:
+                raise SourceError(f"the motion that ends at {rest[k][21]} s starts from no earlier frame", where=path)
+            yield _record(path, trajectory, start, k, rest[k][:21])
+
+    return VoLog(StoredRecords.of(records()))
 
 
 def _record(path: Path, trajectory: Trajectory, start: int, end: int, elements: Sequence[str]) -> VoRecord:

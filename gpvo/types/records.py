@@ -9,6 +9,7 @@ from collections import Counter
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, fields, replace
 from enum import Enum
+from itertools import islice
 from typing import Any, TypeVar, overload
 
 import numpy as np
@@ -17,6 +18,8 @@ from numpy.typing import NDArray
 from gpvo.types.sensors import VEHICLES, Array, ImuLog, StereoCamera, Vehicle, field_names
 
 _NUMBER = r"-?\d+(?:\.\d+)?(?:e[+-]?\d+)?"
+_KINDS: dict[str, Any] = {"int": np.int64, "bool": bool, "Status": object, "str": object}
+_AT_ONCE = 1000  # records as objects
 _Item = TypeVar("_Item")
 _Rows = TypeVar("_Rows", bound="Columns[Any]")
 
@@ -168,6 +171,33 @@ class StoredRecords(Columns[VoRecord]):
     covariances: Mapping[str, Array] = field(default_factory=dict)
     v_t: Mapping[str, Array] = field(default_factory=dict)
     stage_ms: Mapping[str, Array] = field(default_factory=dict)
+
+    @classmethod
+    def of(cls, records: Iterable[VoRecord]) -> StoredRecords:
+        """Records as they come: a thousand at a time are objects."""
+        coming, parts = iter(records), list[StoredRecords]()
+        while (some := list(islice(coming, _AT_ONCE))) or not parts:
+            parts.append(cls._of_all(some))
+        return cls.join(parts)
+
+    @classmethod
+    def _of_all(cls, records: list[VoRecord]) -> StoredRecords:
+        def column(name: str, kind: str) -> NDArray[Any]:
+            shape = {"T_prev_cur": (4, 4)} | dict.fromkeys(IMU_FIELDS, (3,))
+            values = [np.full(3, np.nan) if (v := getattr(r, name)) is None else v for r in records]
+            return np.array(values, _KINDS.get(kind, np.float64)).reshape(len(records), *shape.get(name, ()))
+
+        def stated(name: str, n: int) -> dict[str, Array]:
+            maps, absent, (i, j) = [getattr(r, name) for r in records], np.full((n, n), np.nan), np.triu_indices(n)
+            return {m: np.array([of.get(m, absent)[i, j] for of in maps]) for m in {m: 0 for of in maps for m in of}}
+
+        stages = {stage: 0 for r in records for stage in r.stage_ms}
+        return cls(
+            {f.name: column(f.name, str(f.type)) for f in fields(VoRecord) if not str(f.type).startswith("Mapping")},
+            stated("covariances", 6),
+            stated("v_t", 3),
+            {stage: np.array([r.stage_ms.get(stage, np.nan) for r in records]) for stage in stages},
+        )
 
     def made(self, k: int) -> VoRecord:
         """Record k."""

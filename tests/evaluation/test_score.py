@@ -22,7 +22,7 @@ from gpvo.io.run import write_run
 from gpvo.io.run_read import Run, read_run
 from gpvo.io.stated import HEADER, read_stated, write_stated
 from gpvo.io.trajectory import read_tum, tum_line, write_tum
-from gpvo.types import Mounting, Status, StereoTracks, VoLog, VoRecord
+from gpvo.types import Mounting, Status, StereoTracks, StoredRecords, VoLog, VoRecord
 from synthetic_runs import make_run as synthetic_run
 
 ROOT = Path(__file__).parents[2]
@@ -44,6 +44,7 @@ def test_files_alone_give_the_scores_of_evaluate(written) -> None:
     found = score_sequence(folder / "triangulation" / "hall.txt", folder / "truth" / "hall.txt")
     of_run = evaluation.consistency["triangulation"]
     assert (found.motions, found.lost) == (N - 2, 2)
+    assert isinstance(read_stated(folder / "triangulation" / "hall.txt").records, StoredRecords)
     # Nine decimals of a file stand for motions of sigma 0.2 to 2e-3.
     assert found.nees_dof == pytest.approx(of_run.nees_dof["joint"].mean, rel=1e-4)
     assert found.nll_per_dim == pytest.approx(of_run.nll_per_dim, abs=1e-4)

@@ -21,6 +21,7 @@ from gpvo.types import (
     Prediction,
     Status,
     StereoCamera,
+    StoredRecords,
     TruthLog,
     VoLog,
     VoRecord,
@@ -136,6 +137,13 @@ def test_a_log_takes_a_kilobyte_a_motion(tmp_path):
     held = tracemalloc.get_traced_memory()[0]
     tracemalloc.stop()
     assert held < 1024 * len(run.log)
+
+
+def test_records_that_come_one_by_one_are_the_same_as_columns():
+    records = make_records(1205)  # more than are objects at once
+    for one, other in zip(StoredRecords.of(iter(records)), records, strict=True):
+        assert_same(one, other)
+    assert len(StoredRecords.of([])) == 0
 
 
 def test_predictions_take_two_kilobytes_each(tmp_path):
