@@ -107,7 +107,7 @@ def _record(path: Path, trajectory: Trajectory, start: int, end: int, elements: 
     )
 
 
-def to_records(log: ForeignLog) -> tuple[list[VoRecord], list[str]]:
+def to_records(log: ForeignLog) -> tuple[StoredRecords, list[str]]:
     """Records of the motions between the rows of a log of the camera, and remarks for the user.
 
     A covariance of motions becomes the method ``imported``. One of poses becomes the growth from row to row, if that
@@ -139,14 +139,16 @@ def to_records(log: ForeignLog) -> tuple[list[VoRecord], list[str]]:
         notes.append(
             f"its frames are {usual_s:.3g} s apart as read: are the stamps milliseconds, or numbers of frames?"
         )
-    records = [VoRecord(int(t[0]), int(t[0]), Status.START, np.eye(4), **_fields(log, 0))]
-    for k, motion in enumerate(motions, 1):
-        said = _fields(log, k) | {"reason": lost.get(k, "")}
-        if cov is not None and is_positive_definite(cov[k]):
-            said["covariances"] = {name: cov[k]}
-        status = Status.LOST if k in lost else Status.OK
-        records.append(VoRecord(int(t[k]), int(t[k - 1]), status, motion, **said))
-    return records, [*log.notes, *notes]
+
+    def records() -> Iterator[VoRecord]:
+        yield VoRecord(int(t[0]), int(t[0]), Status.START, np.eye(4), **_fields(log, 0))
+        for k, motion in enumerate(motions, 1):
+            said = _fields(log, k) | {"reason": lost.get(k, "")}
+            if cov is not None and is_positive_definite(cov[k]):
+                said["covariances"] = {name: cov[k]}
+            yield VoRecord(int(t[k]), int(t[k - 1]), Status.LOST if k in lost else Status.OK, motion, **said)
+
+    return StoredRecords.of(records()), [*log.notes, *notes]
 
 
 def is_turn_unknown(covariance: Array) -> NDArray[np.bool_]:

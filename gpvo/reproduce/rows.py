@@ -102,11 +102,11 @@ class RealRun:
         log = read_foreign(self.source)
         given = read_foreign(self.truth, complete=True).trajectory
         records, notes = to_records(log)
-        records = records[: self.frames]
+        used = VoLog(records[: self.frames])
         truth = TruthLog(given.t_ns, given.T_world_body)
-        check_overlap(truth, VoLog(records).t_ns, self.truth)
+        check_overlap(truth, used.t_ns, self.truth)
         meta = {"source": self.source.name, "kind": "import", "notes": notes}
-        write_run(path, VoLog(records), truth=truth, meta=meta)
+        write_run(path, used, truth=truth, meta=meta)
 
 
 def attempt(run: RealRun, store: Store) -> str:
