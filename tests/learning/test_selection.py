@@ -3,7 +3,7 @@ what there is to select from."""
 
 from __future__ import annotations
 
-from dataclasses import asdict, replace
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -67,7 +67,7 @@ def test_what_one_sequence_lacks_and_others_know_is_named(capsys) -> None:
     assert lacking([*poor, *sets[1:]], config) == {sets[0].name: ["counts"]}
     assert lacking([*poor, *sets[1:]], TrainConfig(features="velocity")) == {}
     assert lacking(poor, config) == {}
-    _tell(TrainedModel({}, {"target": "frame"}, sets=[*poor, *sets[1:]]), asdict(config))
+    _tell(TrainedModel({}, {"target": "frame"}, sets=[*poor, *sets[1:]]), config)
     said = capsys.readouterr().err
     assert f"{sets[0].name} holds no counts, as other runs do" in " ".join(said.split())
     assert said.count("gpvo:") == 1

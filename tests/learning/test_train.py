@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import re
-from dataclasses import asdict, replace
+from dataclasses import replace
 from functools import cache
 from pathlib import Path
 from xml.etree import ElementTree
@@ -206,10 +206,11 @@ def test_a_training_goes_on_from_its_finished_folds_and_the_same_data_give_the_s
     whole, fitted = training._fold, []
 
     def fold(held_out, *rest):
+        (alone,) = held_out
         if len(fitted) == 1 and not broken_off:
-            broken_off.append(held_out.name)
+            broken_off.append(alone.name)
             raise KeyboardInterrupt
-        fitted.append(held_out.name)
+        fitted.append(alone.name)
         return whole(held_out, *rest)
 
     broken_off: list[str] = []
@@ -404,7 +405,7 @@ def test_a_model_of_positions_is_not_updated(tmp_path):
     path = tmp_path / "m.gpvo"
     save_model(_of_three(), path)
     with pytest.raises(GpvoError, match="train again"):
-        _train([tmp_path], asdict(replace(QUICK, target="position")), path, print)
+        _train([tmp_path], replace(QUICK, target="position"), path, print)
 
 
 def _as_run(log, truth, name):
@@ -623,7 +624,7 @@ def test_a_run_given_twice_is_refused(tmp_path):
     """Left out in turn, its copy would still be learnt from."""
     run = tmp_path / "run"
     with pytest.raises(GpvoError, match="run.* is given twice"):
-        _train([run, tmp_path / "other", tmp_path / "other" / ".." / "run"], asdict(QUICK), None, print)
+        _train([run, tmp_path / "other", tmp_path / "other" / ".." / "run"], QUICK, None, print)
 
 
 def test_a_model_knows_the_odometry_that_it_was_trained_on(tmp_path: Path) -> None:
