@@ -44,6 +44,13 @@ class CameraModel(ABC):
         count = next((n for n in (4, 5) if not any(self.distortion[n:])), len(self.distortion))
         return [float(k) for k in self.distortion[:count]]
 
+    @property
+    def distortion_model(self) -> str:
+        """What Kalibr calls the distortion, or ROS that of eight coefficients."""
+        if self.kind == "kannala-brandt":
+            return "equidistant"
+        return "rational_polynomial" if len(self.coefficients) > 5 else "radtan"
+
     def project(self, points: Array) -> tuple[Array, NDArray[np.bool_]]:
         """(N, 3) points to (N, 2) pixels and (N,) whether the lens can see the point (also outside the image)."""
         xy, valid = self._to_plane(np.asarray(points, dtype=np.float64).reshape(-1, 3))

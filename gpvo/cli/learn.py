@@ -27,6 +27,7 @@ if TYPE_CHECKING:
     from gpvo.learning.train import OnFit, TrainedModel
 
 _MOST_COLUMNS = 3  # of folds: more do not fit into 80 columns
+_MOST_NAMES = 24
 
 Runs = Annotated[list[Path], "Run folders with ground truth, or one file of training rows."]
 
@@ -208,10 +209,8 @@ def _print_table(document: dict[str, Any]) -> None:
         "run" if document.get("folds_are") != "time blocks" else "part of one run (this says nothing about other runs)"
     )
     say(f"NEES per degree of freedom on each {what} left out (1 is right), then means")
-    if few:
-        say(", ".join(f"{k + 1}: {f['held_out']} ({f['rows']} rows)" for k, f in enumerate(document["folds"])))
-    else:
-        say(f"{len(document['folds'])} runs; the document (--json) has a line for each")
+    names = [f"{k + 1}: {f['held_out']} ({f['rows']} rows)" for k, f in enumerate(document["folds"])]
+    say(", ".join(names) if len(names) <= _MOST_NAMES else f"{len(names)} runs; --json has a line for each")
     show(("method", *columns, "mean", "median", "1 sig", "NLL", "stated"), rows)
     say("1 sig: share within 1 sigma (0.68 is right). NLL: nats per axis, as a Gaussian, lower is better;")
     say("stated: under the stated density, where it has heavier tails. _vt: for the translation alone.")

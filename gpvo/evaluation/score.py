@@ -27,7 +27,7 @@ from gpvo.io.trajectory import check_overlap, read_tum, write_tum
 from gpvo.online.features import AXES
 from gpvo.online.predictor import Predictor
 from gpvo.stats.series import sequence_bootstrap
-from gpvo.types import IMPORTED, Array, Mounting, Status, TruthLog, VoLog, VoRecord
+from gpvo.types import IMPORTED, Array, Mounting, Status, StoredRecords, TruthLog, VoLog, VoRecord
 
 if TYPE_CHECKING:
     from gpvo.learning.config import TrainConfig
@@ -116,7 +116,8 @@ def _read(stated: Path) -> VoLog:
     log = read_foreign(stated, "csv", covariance_of="motion", covariance_axes="body")
     if log.covariance is None:
         raise SourceError("states no covariances", where=stated, cure="add columns cov_00, cov_01, ... of the motions")
-    return VoLog([_owned_up(r, C, stated) for r, C in zip(to_records(log)[0], log.covariance, strict=True)])
+    pairs = zip(to_records(log)[0], log.covariance, strict=True)
+    return VoLog(StoredRecords.of(_owned_up(record, C, stated) for record, C in pairs))
 
 
 def _owned_up(record: VoRecord, covariance: Array, where: Path) -> VoRecord:
@@ -231,7 +232,8 @@ def _charged(log: VoLog, e: Evaluation) -> tuple[Array, Array]:
 
 
 def write_left_out(trained: TrainedModel, runs: Sequence[Run], config: TrainConfig, folder: Path) -> None:
-    """What each method, fitted to the other runs, states of every run: the training's table, as files.
+    """What each method, fitted to the other runs, or to those of other parts where they are many, states of every run:
+    the training's table, as files.
 
     ``trained`` from the same ``runs``, in their order, with its folds kept in ``config.keep``.
     """

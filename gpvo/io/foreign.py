@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from itertools import compress, islice
 from pathlib import Path
@@ -141,6 +141,12 @@ def guess_format(path: Path) -> str:
     raise SourceError("does not look like a trajectory file", where=path, cure=cure)
 
 
+_READ_BY = {
+    "--map": ("csv",), "--topic": ("bag",), "--covariance-of motion": ("csv",), "--covariance-axes": ("csv", "bag")
+}  # fmt: skip
+_MOST_COUNTED = 2**31
+
+
 def read_foreign(
     path: str | Path,
     kind: str | None = None,
@@ -177,12 +183,8 @@ def read_foreign(
         raise SourceError(f"covariances are of pose or motion, in axes {' or '.join(COVARIANCE_AXES)}", where=p)
     if not p.exists():
         raise SourceError("no such file", where=p)
-    for option, is_asked, formats in (
-        ("--map", mapping, ("csv",)),
-        ("--topic", topic, ("bag",)),
-        ("--covariance-of motion", covariance_of == "motion", ("csv",)),
-        ("--covariance-axes", covariance_axes != "auto", ("csv", "bag")),
-    ):
+    asked = (mapping, topic, covariance_of == "motion", covariance_axes != "auto")
+    for (option, formats), is_asked in zip(_READ_BY.items(), asked, strict=True):
         if is_asked and name not in formats:
             cure = "leave it out, or name the format with --format or --truth-format"
             raise SourceError(f"{option} has no effect on this file ({name})", where=p, cure=cure)
@@ -230,9 +232,22 @@ def _from_table(path: Path, table: Table, covariance_of: str, axes: str, complet
         trajectory,
         cov,
         covariance_of,
-        {n: c[n][known] for n in (*COUNT_FIELDS, *FLOAT_FIELDS) if n in c},
+        _features(path, c, known, lines),
         (*notes, *((f"left out: {counted(lost, 'row')} without a pose",) if lost else ()), *_unused(table, cov)),
     )
+
+
+def _features(
+    path: Path, columns: Mapping[str, Array], known: NDArray[np.bool_], lines: Sequence[int]
+) -> dict[str, Array]:
+    """Those of the rows with a pose, which are these ``lines``. Raises SourceError for a count that is none."""
+    out = {name: columns[name][known] for name in (*COUNT_FIELDS, *FLOAT_FIELDS) if name in columns}
+    for name, values in out.items():
+        beyond = np.isfinite(values) & (np.abs(values) >= _MOST_COUNTED)
+        if name in COUNT_FIELDS and beyond.any():
+            k = int(beyond.argmax())
+            raise SourceError(f"line {lines[k]}: {values[k]:g} is no count ({name})", where=path)
+    return out
 
 
 def _unused(table: Table, covariance: Array | None) -> tuple[str, ...]:

@@ -65,7 +65,7 @@ class TrainedModel:
 def train(
     runs: Iterable[Run | str | Path], config: TrainConfig | None = None, *, on_fit: OnFit = lambda done, total: None
 ) -> TrainedModel:
-    """Learn from runs with ground truth, or their folders, and judge by leaving each run out;
+    """Learn from runs with ground truth, or their folders, and judge by leaving each run out, or parts of many;
     :func:`gpvo.learning.store.save_model` writes the result.
 
     ``on_fit`` is called with how many fits are done, of how many, for progress bars. Raises GpvoError if a run has no
@@ -335,12 +335,12 @@ def train_position(sets: Sequence[TrainingSet], config: TrainConfig, *, judge: b
     """The thesis' model of positions: a GP of the residuals (n, 3) [m] on velocity and feature count, isotropic;
     ``features="auto"`` means these."""
     model = _fit_position(sets, config)
-    fitted: dict[str, ThesisModel] = {}
-    for held_out, others in leave_out(sets, MOST_FOLDS) if judge and len(sets) > 1 else ():
-        fitted |= dict.fromkeys((s.name for s in held_out), _fit_position(others, config))
+    parts = leave_out(sets, MOST_FOLDS) if judge and len(sets) > 1 else ()
+    fitted = [_fit_position(others, config) for _, others in parts]
     folds: list[dict[str, Any]] = []
-    for s in sets if fitted else ():
-        stated = fitted[s.name].predict(s.select(fitted[s.name].columns))
+    for k, s in enumerate(sets if fitted else ()):
+        of_others = fitted[k % len(fitted)]
+        stated = of_others.predict(s.select(of_others.columns))
         methods: dict[str, Any] = {m: empty() for m in METHODS} | {"gp_thesis": score(s.Y, *stated)}
         folds.append({"held_out": s.name, "rows": len(s), "lost": s.counts["lost"], "methods": methods})
     X = np.concatenate([s.select(model.columns) for s in sets])

@@ -285,7 +285,7 @@ class BaseFrameStage:
             self._tree.take(arrival.message)
             self.counts["tf_refused"] = self._tree.refused
             self._look_again()
-            yield from self.inner.take(arrival)  # it may place an IMU, too
+            yield from map(self._of_base, self.inner.take(arrival))  # it may place an IMU, too
             return
         names_it = arrival.topic == self.topic
         if names_it and self._T_base_source is None and not self._is_placed(arrival.message):

@@ -126,6 +126,7 @@ class StereoStage:
         topic, message = arrival.topic, arrival.message
         if topic == TF_STATIC:
             self._tree.take(message)
+            self.counts["tf_refused"] = self._tree.refused
             return
         if topic == self.imu:
             self._take_imu(message)
@@ -157,6 +158,8 @@ class StereoStage:
     def problems(self) -> list[str]:
         """Images that nobody says the calibration of, that it is not for, that make no pair, cannot be read, or are
         swapped; and an IMU that says nothing of them."""
+        if self.camera is None and self._unfit:
+            return [self._unfit]
         if self.camera is None and self.counts["uncalibrated"]:
             return ["images arrive, but no calibration: no CameraInfo comes with them"]
         nearest_ns, apart = self._pairs.nearest_ns, ""
@@ -175,7 +178,7 @@ class StereoStage:
             image = decode_message(message, self._depth)
             if image is None or image.shape != (lens.height, lens.width):
                 self.counts["unreadable"] += 1
-                self._unfit = f"images of encoding '{encoding_of(message)}' cannot be read"
+                self._unfit = _unread(message)
                 if image is not None:
                     size = f"{image.shape[1]}x{image.shape[0]}"
                     self._unfit = f"images are {size}, the calibration is for {lens.width}x{lens.height}"
@@ -235,9 +238,13 @@ class StereoStage:
         names = [info_topic(t) for t in (self.left, self.right)]
         if self.camera is not None or (self.wants_info and not all(n in self._infos for n in names)):
             return
-        sizes = [(i.shape[1], i.shape[0]) for i in map(decode_message, (left, right)) if i is not None]
-        if len(sizes) < 2:
-            return
+        sizes = []
+        for message in (left, right):
+            if (image := decode_message(message)) is None:
+                self._unfit = _unread(message)
+                return
+            sizes.append((image.shape[1], image.shape[0]))
+        self._unfit = ""
         if self._without_size is not None:
             self._calibrate(read_stereo_yaml(self._without_size, size=sizes[0]))
             return
@@ -320,3 +327,7 @@ def _columns(samples: Iterable[tuple[int, Array]]) -> tuple[Stamps, Array]:
     """Stamps (N,) and samples (N, 6)."""
     t_ns, rows = zip(*samples, strict=True)
     return np.array(t_ns, dtype=np.int64), np.array(rows)
+
+
+def _unread(image: Any) -> str:
+    return f"images of encoding '{encoding_of(image)}' cannot be read"

@@ -269,11 +269,11 @@ def _write_truth(folder: Path, t_ns: NDArray[np.int64], motion: Motion, bias_gyr
 
 def _lens(lens: CameraModel, coefficients: str, radtan: str) -> dict[str, Any]:
     """In the words of EuRoC or of Kalibr."""
-    fisheye = lens.kind == "kannala-brandt"
+    name = lens.distortion_model
     return {
         "camera_model": "pinhole",
         "intrinsics": lens.intrinsics_px,
-        "distortion_model": "equidistant" if fisheye else radtan,
+        "distortion_model": radtan if name == "radtan" else name,
         f"distortion_{coefficients}": lens.coefficients,
         "resolution": [lens.width, lens.height],
     }

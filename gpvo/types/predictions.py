@@ -6,17 +6,15 @@ import math
 from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass, fields
 from functools import cached_property
-from itertools import islice
 from typing import Any, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
 
-from gpvo.types.records import Columns, Status, VoLog
+from gpvo.types.records import Columns, Status, VoLog, batches
 from gpvo.types.sensors import Array
 
 _SAME_S = 1e-6
-_AT_ONCE = 1000  # predictions as objects
 _MOST_PERSISTENT = 12
 _Error = TypeVar("_Error", bound="MotionError")
 
@@ -134,8 +132,8 @@ class StoredPredictions(Columns[Prediction]):
         """Predictions as they come: a thousand at a time are objects."""
         if isinstance(predictions, StoredPredictions):
             return predictions
-        coming, parts = iter(predictions), dict[str, list[NDArray[Any]]]()
-        while (some := list(islice(coming, _AT_ONCE))) or not parts:
+        parts = dict[str, list[NDArray[Any]]]()
+        for some in batches(predictions):
             columns = {f.name: [getattr(p, f.name) for p in some] for f in fields(Prediction)}
             columns["persistent_root"] = [_wide(root, 0.0) for root in columns["persistent_root"]]
             columns["persistent_tau_s"] = [_wide(tau_s, 1.0) for tau_s in columns["persistent_tau_s"]]

@@ -19,7 +19,7 @@ from gpvo.types.sensors import VEHICLES, Array, ImuLog, StereoCamera, Vehicle, f
 
 _NUMBER = r"-?\d+(?:\.\d+)?(?:e[+-]?\d+)?"
 _KINDS: dict[str, Any] = {"int": np.int64, "bool": bool, "Status": object, "str": object}
-_AT_ONCE = 1000  # records as objects
+_AT_ONCE = 1000
 _Item = TypeVar("_Item")
 _Rows = TypeVar("_Rows", bound="Columns[Any]")
 
@@ -159,6 +159,14 @@ class Columns(Sequence[_Item], ABC):
         return [self.made(i) for i in range(*k.indices(len(self)))] if isinstance(k, slice) else self.made(k)
 
 
+def batches(items: Iterable[_Item]) -> Iterator[list[_Item]]:
+    """Items as they come, a thousand at a time; one empty list where there are none."""
+    coming = iter(items)
+    yield list(islice(coming, _AT_ONCE))
+    while some := list(islice(coming, _AT_ONCE)):
+        yield some
+
+
 @dataclass(frozen=True, eq=False)
 class StoredRecords(Columns[VoRecord]):
     """N records as columns, a fifth of what they take as objects.
@@ -174,11 +182,10 @@ class StoredRecords(Columns[VoRecord]):
 
     @classmethod
     def of(cls, records: Iterable[VoRecord]) -> StoredRecords:
-        """Records as they come: a thousand at a time are objects."""
-        coming, parts = iter(records), list[StoredRecords]()
-        while (some := list(islice(coming, _AT_ONCE))) or not parts:
-            parts.append(cls._of_all(some))
-        return cls.join(parts)
+        """Records as they come, few of them as objects at a time; those that are stored already, as they are."""
+        if isinstance(records, StoredRecords):
+            return records
+        return cls.join([cls._of_all(some) for some in batches(records)])
 
     @classmethod
     def _of_all(cls, records: list[VoRecord]) -> StoredRecords:
@@ -187,15 +194,12 @@ class StoredRecords(Columns[VoRecord]):
             values = [np.full(3, np.nan) if (v := getattr(r, name)) is None else v for r in records]
             return np.array(values, _KINDS.get(kind, np.float64)).reshape(len(records), *shape.get(name, ()))
 
-        def stated(name: str, n: int) -> dict[str, Array]:
-            maps, absent, (i, j) = [getattr(r, name) for r in records], np.full((n, n), np.nan), np.triu_indices(n)
-            return {m: np.array([of.get(m, absent)[i, j] for of in maps]) for m in {m: 0 for of in maps for m in of}}
-
-        stages = {stage: 0 for r in records for stage in r.stage_ms}
+        log, (i, j), (k, m) = VoLog(records), np.triu_indices(6), np.triu_indices(3)
+        stages = dict.fromkeys(stage for r in records for stage in r.stage_ms)
         return cls(
             {f.name: column(f.name, str(f.type)) for f in fields(VoRecord) if not str(f.type).startswith("Mapping")},
-            stated("covariances", 6),
-            stated("v_t", 3),
+            {method: log.covariance(method)[:, i, j] for method in log.methods},
+            {method: log.v_t(method)[:, k, m] for method in log.v_t_methods},
             {stage: np.array([r.stage_ms.get(stage, np.nan) for r in records]) for stage in stages},
         )
 

@@ -284,7 +284,7 @@ def camchain(rig: StereoRig) -> str:
         chain[name] = {
             "camera_model": "pinhole",
             "intrinsics": lens.intrinsics_px,
-            "distortion_model": "equidistant" if len(lens.distortion) == 4 else "radtan",
+            "distortion_model": lens.distortion_model,
             "distortion_coeffs": lens.coefficients,
             "resolution": [lens.width, lens.height],
         }

@@ -172,6 +172,9 @@ def test_columns_by_mapping_with_counts_and_covariance(tmp_path):
     names |= {"matches": "n_inliers", "blur": "sharpness"}
     log = read_foreign(path, mapping=names, covariance_of="motion", covariance_axes="body")
     records, notes = to_records(log)
+    beyond = _csv(tmp_path / "b.csv", header, [*variances, [*counts[:5], 1e30, *counts[6:]], blur])
+    with pytest.raises(SourceError, match=r"line 7: 1e\+30 is no count \(n_inliers\)"):
+        read_foreign(beyond, mapping=names)
     assert not notes
     assert records[0].status is Status.START
     assert records[7].n_inliers == 107

@@ -464,6 +464,18 @@ def test_window_target():
     assert said[20].dt_s == pytest.approx(0.5)
 
 
+def test_positions_of_runs_of_one_name_are_judged_by_the_other_parts(monkeypatch):
+    monkeypatch.setattr(training, "MOST_FOLDS", 2)
+    config = TrainConfig(target="position")
+    sets = [build(*make_run(k, n=60), name="run", target="position") for k in range(3)]
+    folds = training.train_position(sets, config).table["folds"]
+    for k, (fold, s) in enumerate(zip(folds, sets, strict=True)):
+        model = training._fit_position([other for i, other in enumerate(sets) if i % 2 != k % 2], config)
+        found = score(s.Y, *model.predict(s.select(model.columns)))
+        size_m = fold["methods"]["gp_thesis"]["rmse_corrected"]["translation_m"]
+        assert size_m == pytest.approx(found["rmse_corrected"]["translation_m"], rel=1e-9)
+
+
 def test_position_target_has_its_own_type(tmp_path):
     from gpvo.dataset.build import build
     from gpvo.learning.thesis import ThesisModel

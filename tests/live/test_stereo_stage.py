@@ -198,6 +198,14 @@ def test_images_that_make_no_pair_or_cannot_be_read_are_called_out() -> None:
     assert unread.problems() == ["images of encoding 'h264' cannot be read"]
 
 
+def test_images_that_cannot_be_read_are_called_out_beside_their_calibration() -> None:
+    stage = StereoStage(LEFT, RIGHT)
+    for t, topic, message in sorted(stereo_bag(ros1=False).messages, key=lambda m: m[0]):
+        message = replace(message, encoding="h264") if topic in (LEFT, RIGHT) else message
+        assert not list(stage.take(Arrival(topic, message, t)))
+    assert stage.problems() == ["images of encoding 'h264' cannot be read"]
+
+
 def test_real_pictures_and_a_source_that_starts_again(real_data: Path) -> None:
     folder = real_data / "kitti_2011_09_26_0001"
     names = sorted(p.name for p in (folder / "image_0").glob("*.png"))[:6]
