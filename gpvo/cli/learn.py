@@ -14,7 +14,6 @@ from gpvo.cli.common import is_given, refuse_twice
 from gpvo.cli.output import Json, cell, note, print_json, progress, say, show, status, time_offset
 from gpvo.cli.twin import TwinOptions, Twins, in_place_of_runs_without_truth
 from gpvo.dataset.errors import motion_errors
-from gpvo.dataset.misread import Misread, late_by
 from gpvo.dataset.truth_noise import made_from_odometry
 from gpvo.errors import GpvoError, counted
 from gpvo.files import refuse_folder
@@ -115,6 +114,7 @@ def _rows(paths: list[Path], config: TrainConfig) -> Iterator[TrainingSet]:
     """Of one run after the other, with a note if its poses or stamps, or those of its truth, seem not to be what they
     are taken for."""
     from gpvo.dataset.build import aligned
+    from gpvo.dataset.misread import Misread, late_by
 
     as_is = replace(config, align="none", time_offset_s=0.0)
     for path in paths:

@@ -242,10 +242,10 @@ def write_left_out(trained: TrainedModel, runs: Sequence[Run], config: TrainConf
     assert config.keep is not None
     names = distinct([run.name for run in runs])
     options = EvaluateOptions(align=config.align, time_offset_s=config.time_offset_s)
-    named = leave_out(list(zip(names, runs, strict=True)), MOST_FOLDS)
-    for (held_out, others), (left_out, _) in zip(leave_out(trained.sets, MOST_FOLDS), named, strict=True):
-        predictor = Predictor.load(fold_model(held_out, others, config, config.keep))
-        for name, run in left_out:
+    for held_out, others in leave_out(list(zip(trained.sets, names, runs, strict=True)), MOST_FOLDS):
+        sets, learned_from = ([s for s, *_ in part] for part in (held_out, others))
+        predictor = Predictor.load(fold_model(sets, learned_from, config, config.keep))
+        for _, name, run in held_out:
             write_statements(evaluate_run(run, predictor, options), folder, name, waits=config.waits)
 
 
