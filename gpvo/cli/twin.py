@@ -65,9 +65,11 @@ Seed = Annotated[
 
 
 def twin(
+    ctx: typer.Context,
     runs: Annotated[list[Path], "Run folders made with --keep-tracks."],
     out: Annotated[Path | None, "Folder for the twins."] = None,
     against: Annotated[bool, "Compare with the runs' ground truth: real errors over predicted ones."] = False,
+    align: Annotated[str, "Fit between log and truth: a fixed rotation, transform (with lever arm) or none."] = "none",
     options: TwinOptions = TwinOptions(),
     seed: Annotated[int, "Random seed.", {"min": 0}] = 0,
     jobs: Annotated[int, "Twins to make in parallel; -1 for one per core."] = 1,
@@ -79,10 +81,15 @@ def twin(
 
     Example: gpvo twin runs/mine -o twins --tolerance d455
     """
+    if not against:
+        refuse_idle(ctx, ("align",), "without --against", "add --against")
     settings = options.settings(seed)
     if out is None and not against:
         raise GpvoError("no folder was given for the twins", cure="give a folder with -o, or compare with --against")
-    real = [read_run(path) for path in runs] if against else []  # before the work, not after it
+    with status("starting"):
+        from gpvo.dataset.build import aligned
+
+    real = [aligned(read_run(path), align)[0] for path in runs] if against else []  # before the work, not after it
     if without := [run.path for run in real if run.truth is None]:
         raise GpvoError("has no ground truth to compare twins with", where=without[0], cure="leave out --against")
     for run in real:

@@ -11,8 +11,9 @@ from gpvo.dataset.errors import motion_errors
 from gpvo.dataset.truth_noise import TruthNoise
 from gpvo.errors import GpvoError, SourceError
 from gpvo.evaluation.by_twins import ratios, twin_covariance
+from gpvo.geometry import se3
 from gpvo.io import open_source
-from gpvo.io.run import read_run
+from gpvo.io.run import copy_run, read_run
 from gpvo.runner import run
 from gpvo.sim.points import simulate_points
 from gpvo.twin.gap import Gap, pooled, read_gap
@@ -186,6 +187,22 @@ def test_ratios_of_real_errors_to_those_that_twins_predict(flown, tmp_path):
     assert "nan" not in shown  # a flight of less than ten metres has no row for them
     with pytest.raises(SourceError, match="no ground truth"):
         ratios(replace(real, truth=None), [])
+
+
+def test_ratios_know_of_a_truth_that_is_turned(flown, tmp_path):
+    folder, real, _ = flown
+    turn = se3.exp(np.array([0.0, 0.0, 0.0, 0.05, 0.0, 0.0]))
+    copy_run(real, tmp_path / "run", replace(real.truth, T_world_cam=real.truth.T_world_cam @ turn))
+    as_is, fitted = (
+        json.loads(gpvo("twin", tmp_path / "run", "--against", "--replicates", 2, "--json", *option).stdout)
+        for option in ((), ("--align", "rotation"))
+    )
+    ratio = [r["pooled"]["1 s"]["ratio"][1] for r in (as_is, fitted)]
+    assert ratio[0] > 3.0
+    assert 0.4 < ratio[1] < 2.5
+    for wrong in (("-o", tmp_path / "twins", "--align", "rotation"), ("--against", "--align", "sideways")):
+        with pytest.raises(GpvoError, match="--against|sideways"):
+            gpvo("twin", folder / "run", *wrong)
 
 
 def test_a_gap_makes_the_errors_of_twins_larger(flown, tmp_path):
