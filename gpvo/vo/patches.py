@@ -51,19 +51,23 @@ def cut(image: Image, uv: Points, window_px: int) -> Patches:
     """
     h, w = image.shape
     whole = np.floor(uv).astype(np.intp)
-    a, b = (uv - whole).astype(np.float32).T[:, :, None, None]
-    half = (window_px - 1) // 2
-    offset = np.arange(-half - 1, window_px - half + 2)
+    a, b = (uv - whole).astype(np.float32).T[:, :, None]
+    half, size = (window_px - 1) // 2, window_px + 3
+    offset = np.arange(-half - 1, size - half - 1)
     column = np.clip(whole[:, :1] + offset, 0, w - 1)
     row = np.clip(whole[:, 1:] + offset, 0, h - 1) * w
-    grey = image.ravel().take(row[:, :, None] + column[:, None, :]).astype(np.float32)
-    level = grey[:, :, :-1] + a * (grey[:, :, 1:] - grey[:, :, :-1])
-    grey = level[:, :-1] + b * (level[:, 1:] - level[:, :-1])
+    grey = image.ravel().take(row[:, :, None] + column[:, None, :], mode="wrap").astype(np.float32)
+    # Pixel after pixel, from the end of each row on to the next one, whose last columns are not used: rows are short.
+    flat = grey.reshape(len(uv), size**2)
+    for part, step in ((a, 1), (b, size)):
+        change = flat[:, step:] - flat[:, :-step]
+        change *= part
+        flat[:, :-step] += change
     out = np.empty((len(uv), 3, window_px, window_px), np.float32)
-    out[:, 0] = grey[:, 1:-1, 1:-1]
-    np.subtract(grey[:, 1:-1, 2:], grey[:, 1:-1, :-2], out=out[:, 1])
-    np.subtract(grey[:, 2:, 1:-1], grey[:, :-2, 1:-1], out=out[:, 2])
-    out[:, 1:] *= 0.5
+    out[:, 0] = grey[:, 1:-2, 1:-2]
+    grey *= 0.5
+    np.subtract(grey[:, 1:-2, 2:-1], grey[:, 1:-2, :-3], out=out[:, 1])
+    np.subtract(grey[:, 2:-1, 1:-2], grey[:, :-3, 1:-2], out=out[:, 2])
     patches = out.reshape(len(uv), 3, window_px**2)
     patches[:, 0] -= patches[:, 0].mean(axis=1, keepdims=True)
     return patches
@@ -100,8 +104,8 @@ def align(patches: Patches, image: Image, start: Points, A: Array, h: Array | No
         misfit = _sampled(image, uv[going], A[going], xy, nearer)
         misfit -= misfit.mean(axis=1, keepdims=True)
         misfit -= sought
-        apart[going] = np.abs(misfit).mean(axis=1)
         r = (D @ misfit[:, :, None])[:, :, 0].astype(np.float64)
+        apart[going] = np.abs(misfit, out=misfit).mean(axis=1)
         if sheared:
             r[:, 2:] += prior[2:] * (A[going, 0] - (1.0, 0.0))
         step = np.clip((gain @ r[:, :, None])[:, :, 0], -1.0, 1.0)
@@ -132,9 +136,9 @@ def _sampled(image: Image, uv: Array, A: Array, xy: Patches, nearer: Patches | N
         u -= whole
         at = at + whole.astype(np.int32) * stride
         parts.append(u)
-    u, v = parts
-    flat = image.ravel()
-    a, b, c, d = (flat.take(at + k).astype(np.float32) for k in (0, 1, w, w + 1))
+    (u, v), flat, at = parts, image.ravel(), at.astype(np.intp)
+    # Nothing is out of range; to wrap is the fastest way not to look.
+    a, b, c, d = (flat[k:].take(at, mode="wrap").astype(np.float32) for k in (0, 1, w, w + 1))
     b -= a
     b *= u
     b += a
