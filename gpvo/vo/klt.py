@@ -15,6 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from gpvo.geometry import se3
+from gpvo.stats.series import median
 from gpvo.types import Array, StereoCamera, StereoFrame, TrackFrame
 from gpvo.vo import opencv
 from gpvo.vo.config import KNOWN_DEPTH_PX, VoConfig
@@ -47,7 +48,7 @@ class _Seen:
     def __len__(self) -> int:
         return len(self.uvd)
 
-    def __getitem__(self, which: NDArray[np.bool_] | slice) -> _Seen:
+    def __getitem__(self, which: NDArray[np.bool_ | np.intp] | slice) -> _Seen:
         return _Seen(*(getattr(self, f.name)[which] for f in fields(self)))
 
     def __add__(self, other: _Seen) -> _Seen:
@@ -122,7 +123,7 @@ class KltFrontend:
         no_patches = np.empty((0, 3, config.klt_window_px**2), np.float32)
         self._nothing = _Seen(np.empty((0, 2), np.float32), np.empty((0, 3)), np.empty((0, 2)), no_patches)
         self._new: _New | None = None
-        self._matched = self._nothing
+        self._matched = self._nothing, np.empty(0, np.intp)  # points seen, and which of them are the last matches
         self._repeats = Repeats()
         self._pool = ThreadPoolExecutor(1)
 
@@ -153,20 +154,20 @@ class KltFrontend:
         if from_scratch:
             return self._find_again(reference, current)
         followed, found, uv, disparity, slope = self._follow(reference, current, T_prev_cur_guess)
-        before, n = reference.seen[found], len(uv)
+        before, n = reference.seen, len(uv)
         # New corners are sought beside the known points where the survey has begun, and else when they are wanted.
         search = self._find_right if current.survey is None else self._with_new_corners
         both = search(current, uv, disparity, slope)
         good = both.good[:n]
-        self._matched = both.seen[:n][good]
+        self._matched = both.seen, np.flatnonzero(good)
         return Matches(
-            before.uvd[good],
-            self._matched.uvd,
+            before.uvd[found][good],
+            both.seen.uvd[:n][good],
             both.row_error[:n][good],
             int(followed[: reference.strong].sum()),
             spare=(np.flatnonzero(found) >= reference.strong)[good],
-            right=self._right_search(current, both, uv[:, 1] - before.left_uv[:, 1]),
-            sought_uvd=reference.seen.uvd,
+            right=self._right_search(current, both, uv[:, 1] - before.left_uv[found, 1]),
+            sought_uvd=before.uvd,
             displaced=self._displaced(both),
         )
 
@@ -193,18 +194,18 @@ class KltFrontend:
         """Carry on the inliers, and add new corners where there are none."""
         current = self._current
         assert current is not None
+        seen, matched = self._matched
         if inliers is None:
-            self._matched, self._new = self._nothing, None
-            inliers = np.zeros(0, bool)
+            matched, inliers, self._new = matched[:0], np.zeros(0, bool), None
         if self._new is None:
-            self._with_new_corners(current, self._nothing.left_uv, np.empty(0), taken_uv=self._matched.left_uv)
-        kept, new = self._matched[inliers], self._new
+            self._with_new_corners(current, self._nothing.left_uv, np.empty(0), taken_uv=seen.left_uv[matched])
+        kept, new = seen[matched[inliers]], self._new
         assert new is not None
         current.seen = kept + new.seen
         current.strong = len(kept) + new.strong
         if current.strong >= at_least:
             self._reference = current
-        self._matched, self._new = self._nothing, None
+        self._new = None
         return len(kept) + new.detected, current.strong
 
     def _expected(self, seen: _Seen, T_prev_cur: Array) -> tuple[Array, Array, Array, Array]:
@@ -264,7 +265,7 @@ class KltFrontend:
         near = coarse[np.clip(row, 0, coarse.shape[0] - 1), np.clip(column, 0, coarse.shape[1] - 1)]
         known = near >= 0
         # Where the block matcher saw nothing, the median of what it saw is the fairest start.
-        default = np.median(near[known]) if known.any() else 2.0
+        default = median(near[known]) if known.any() else 2.0
         return uv, 4.0 * np.where(known, near, default)
 
     def _alone(self, uv: Points, taken_uv: Points) -> Points:
@@ -311,8 +312,8 @@ class KltFrontend:
         d_expected, row_expected = self._rig_error.errors(uvd)
         disparity, row_error = uvd[:, 2] - d_expected, both.row_error - row_expected
         # A pair that is off by the same rows everywhere is still a pair: its rows are counted from there.
-        usual = float(np.median(row_error[np.isfinite(row_error)])) if np.isfinite(row_error).any() else 0.0
-        off_row = both.inside & (np.abs(row_error - usual) > self._config.max_row_error_px)
+        off_px = np.abs(row_error - median(row_error[np.isfinite(row_error)]))
+        off_row = both.inside & (off_px > self._config.max_row_error_px)
         # Corners of noise would not be found even in a good pair.
         sought, known = both.inside.copy(), both.inside & np.isfinite(row_error)
         missing = sought & ~known
@@ -346,10 +347,10 @@ class KltFrontend:
         now = self._with_new_corners(current, uv, disparity)
         n = len(uv)
         good = before.good & now.good[:n]
-        self._matched = now.seen[:n][good]
+        self._matched = now.seen, np.flatnonzero(good)
         # Wrong pairs are no second motion: nothing is said of points sought in vain, nor of how rows move.
         right = self._right_search(current, now, np.empty(0))
-        uvd, displaced = self._matched.uvd, self._displaced(now)
+        uvd, displaced = now.seen.uvd[:n][good], self._displaced(now)
         return Matches(before.seen.uvd[good], uvd, now.row_error[:n][good], n, right=right, displaced=displaced)
 
     def _features(self, view: _View) -> tuple[Points, NDArray[np.uint8]]:

@@ -94,7 +94,7 @@ def align(patches: Patches, image: Image, start: Points, A: Array, h: Array | No
     prior = np.array([1e-3, 1e-3] + [(_GREY / _SLOPE) ** 2] * 2 * sheared)
     # Of the derivatives, only what varies over the patch counts; times a misfit without mean, it alone does anyhow.
     mean = D.mean(axis=2)[:, :, None]
-    H = (D @ D.transpose(0, 2, 1) - size**2 * mean @ mean.transpose(0, 2, 1)).astype(np.float64)
+    H = (D @ D.transpose(0, 2, 1) - size**2 * mean * mean.transpose(0, 2, 1)).astype(np.float64)
     gain = np.linalg.inv(H + np.diag(prior))
     # Half the depth within a patch is no plane but a wrong slope.
     nearer = None if h is None else 1.0 / np.maximum(1.0 + h.astype(np.float32) @ xy, np.float32(0.5))
