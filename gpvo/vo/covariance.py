@@ -211,7 +211,7 @@ class DesignEffect:
         share = motion.uvd_prev[:, :2] / [camera.width, camera.height]
         column, row = np.clip((share * _PARTS).astype(np.int64), 0, np.array(_PARTS) - 1).T
         part = row * _PARTS[0] + column == np.arange(_PARTS[0] * _PARTS[1])[:, None]
-        information = np.stack([np.einsum("ikn,iln->kl", B, B) for B in (A[..., p] for p in part)])
+        information = (part @ np.einsum("ikn,iln->nkl", A, A).reshape(-1, 36)).reshape(-1, 6, 6)
         total = information.sum(axis=0)
         told = information @ np.linalg.inv(total)  # by each part; the motion takes the square of it off
         expected = float(np.trace(told, axis1=1, axis2=2).sum() - (told * told.transpose(0, 2, 1)).sum())

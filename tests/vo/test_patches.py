@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 from gpvo.types import Array
-from gpvo.vo.opencv import Image
+from gpvo.vo.opencv import Image, Light, halve, image_stats
 from gpvo.vo.patches import align, cut
 from hypothesis import given
 from hypothesis import strategies as st
@@ -127,3 +127,11 @@ def test_patches_beyond_the_border_are_no_error(window_px: int, place: tuple[flo
         assert np.isfinite(found.uv).all()
         assert np.isfinite(found.A).all()
     assert len(align(cut(image, uv[:0], window_px), image, uv[:0], np.empty((0, 2, 2))).uv) == 0
+
+
+def test_the_noise_of_an_image_is_what_immerkaers_mask_says() -> None:
+    image = np.random.default_rng(1).integers(0, 255, (60, 81)).astype(np.uint8)
+    rows = np.pad(image[20:40].astype(float), 1, mode="reflect")
+    response = np.diff(np.diff(rows, 2, axis=0), 2, axis=1)
+    expected = np.sqrt(np.pi / 2) / 6 * np.abs(response).mean() / 255
+    assert image_stats(image, Light.of(halve(image))).noise_level == pytest.approx(expected, rel=1e-12)
