@@ -74,17 +74,15 @@ def replacing(path: Path, own: Own | None = None) -> Iterator[Path]:
     """A temporary path beside ``path`` to write to, in a folder made on the way; at the end of the block it takes its
     place.
 
-    If the block fails, what was written is removed, and ``path`` is as it was. No two writers share a name. Raises
-    OutputError, naming ``path``, where it is not of its ``own`` kind (:func:`refuse_foreign`), or the block or the
-    replacement raises OSError: no right, no space.
+    If the block fails, what was written is removed, and ``path`` is as it was. No two writers share a temporary path;
+    one that a killed process left is taken over. Raises OutputError, naming ``path``, where it is not of its ``own``
+    kind (:func:`refuse_foreign`), or the block or the replacement raises OSError: no right, no space.
     """
-    temporary: Path | None = None
+    temporary, handle = None, -1
     refuse_foreign(path, *own or (b"", "file"))
     make_folder(path.parent)
     try:
-        handle, name = tempfile.mkstemp(dir=path.parent, prefix=f".{path.name}.", suffix=".part")
-        os.close(handle)
-        temporary = Path(name)
+        handle, temporary = _part(path)
         yield temporary
         os.umask(mask := os.umask(0))  # which cannot be asked for otherwise
         os.chmod(temporary, 0o666 & ~mask)
@@ -96,6 +94,30 @@ def replacing(path: Path, own: Own | None = None) -> Iterator[Path]:
             reason = error.strerror or (str(error).splitlines() or ["the disk refuses"])[-1]
             raise OutputError(f"cannot be written: {reason}", where=path) from None
         raise
+    finally:
+        if handle >= 0:
+            os.close(handle)
+
+
+def _part(path: Path) -> tuple[int, Path]:
+    """An empty file beside ``path``, and the handle that keeps it from other writers: always of one name, so that
+    processes that are killed leave no more than one, or of a new one where that is in use or cannot be locked."""
+    part = path.with_name(f".{path.name}.part")
+    if fcntl is not None:
+        handle = -1
+        try:
+            handle = os.open(part, os.O_RDWR | os.O_CREAT | os.O_NOFOLLOW, 0o600)
+            fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
+            os.fchmod(handle, 0o600)  # nobody else's
+            if os.path.samestat(os.fstat(handle), os.stat(part)):  # else a writer put it in place before it was locked
+                os.ftruncate(handle, 0)
+                return handle, part
+        except OSError:
+            pass  # mkstemp tells, if it is no matter of this one name
+        if handle >= 0:
+            os.close(handle)
+    made = tempfile.mkstemp(dir=path.parent, prefix=f".{path.name}.", suffix=".part")
+    return made[0], Path(made[1])
 
 
 def refuse_foreign(path: Path, mark: bytes, what: str) -> None:

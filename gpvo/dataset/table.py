@@ -4,7 +4,7 @@ memory piece by piece, or in blocks that fit."""
 from __future__ import annotations
 
 import json
-import tempfile
+import shutil
 from collections.abc import Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 
 from gpvo.dataset.build import TrainingSet
 from gpvo.errors import CalibrationError, SourceError
-from gpvo.files import parse_json, replacing
+from gpvo.files import make_folder, parse_json, replacing
 from gpvo.geometry.covariance import LARGEST, are_semidefinite, from_upper, upper
 from gpvo.io.parquet import numbers_of
 from gpvo.types import Array, StereoCamera
@@ -29,12 +29,11 @@ _STATED = ("name", "target", "counts", "camera", "odometry", "columns", "lost_xi
 
 def write_sets(path: str | Path, sets: Iterable[TrainingSet]) -> None:
     """One file of all sequences, in place of what was there; a row group per sequence, one at a time in memory."""
-    path = Path(path)
     about, schemas = [], []
-    with replacing(path) as whole, tempfile.TemporaryDirectory(dir=path.parent, prefix=f".{path.name}.") as folder:
+    with replacing(Path(path)) as whole, _pieces(whole) as folder:
         for i, s in enumerate(sets):
             table = _table(i, s)
-            pq.write_table(table, Path(folder) / str(i), row_group_size=max(len(s), 1))
+            pq.write_table(table, folder / str(i), row_group_size=max(len(s), 1))
             schemas.append(table.schema)
             about.append({name: getattr(s, name) for name in _STATED})
         document = {"schema": SCHEMA, "sequences": about}
@@ -44,10 +43,21 @@ def write_sets(path: str | Path, sets: Iterable[TrainingSet]) -> None:
         schema = pa.unify_schemas(schemas).with_metadata(metadata)
         with pq.ParquetWriter(whole, schema, compression="zstd") as writer:
             for i in range(len(about)):
-                table = pq.ParquetFile(Path(folder) / str(i)).read()  # read_table would load pandas
+                table = pq.ParquetFile(folder / str(i)).read()  # read_table would load pandas
                 n = table.num_rows
                 columns = [table[f.name] if f.name in table.column_names else pa.nulls(n, f.type) for f in schema]
                 writer.write_table(pa.Table.from_arrays(columns, schema=schema), row_group_size=max(n, 1))
+
+
+@contextmanager
+def _pieces(whole: Path) -> Iterator[Path]:
+    """An empty folder beside a file that is being written, in place of one that a killed process left."""
+    folder = whole.with_name(f"{whole.name}s")
+    try:
+        shutil.rmtree(folder, ignore_errors=True)
+        yield make_folder(folder)
+    finally:
+        shutil.rmtree(folder, ignore_errors=True)
 
 
 def read_sets(path: str | Path) -> list[TrainingSet]:

@@ -7,7 +7,7 @@ from pathlib import Path
 import pytest
 from gpvo import cli
 from gpvo.errors import OutputError
-from gpvo.files import refuse_foreign, write_text
+from gpvo.files import refuse_foreign, replacing, write_text
 from gpvo.io.run import write_run
 from gpvo.io.trajectory import write_tum
 from gpvo.learning.store import card_path, picture_path, rows_path
@@ -92,6 +92,23 @@ def test_training_replaces_nothing_beside_its_model_that_is_not_its_own(
         theirs.write_bytes(beside(Path(MODEL)).read_bytes())
         code, said = main(capsys, monkeypatch, "train", tmp_path / "no run", "-o", tmp_path / "notes")
         assert "no such run folder" in said[-1]
+
+
+def test_what_a_killed_process_left_is_taken_over_and_no_two_writers_share_it(tmp_path: Path) -> None:
+    path, left = tmp_path / "notes", tmp_path / ".notes.part"
+    left.write_text("half of what was to be written")
+    with replacing(path) as one:
+        assert (one, one.read_bytes()) == (left, b"")
+        one.write_text("one")
+        with replacing(path) as other:
+            assert other != one
+            other.write_text("other")
+        assert path.read_text() == "other"
+    assert path.read_text() == "one"
+    left.symlink_to(path)
+    with replacing(path) as one:
+        assert path.read_text() == "one"
+    assert [p.name for p in tmp_path.iterdir() if p != left] == ["notes"]
 
 
 def test_what_cannot_be_written_is_refused_before_the_work(tmp_path: Path) -> None:

@@ -1,4 +1,4 @@
-"""Training sets larger than memory: what is keptand that the size of the pieces does not matter."""
+"""Training sets larger than memory: what is kept, and that the size of the pieces does not matter."""
 
 from __future__ import annotations
 
@@ -72,6 +72,16 @@ def test_same_bytes_again(stored_file, tmp_path):
         assert rows == {"given": len(StoredSets(stored_file)), "in_memory": 2048}
         save_model(trained, tmp_path / name)
     assert (tmp_path / "a").read_bytes() == (tmp_path / "b").read_bytes()
+
+
+def test_what_a_killed_process_left_is_taken_over(stored_file, tmp_path):
+    path, left = tmp_path / "rows.parquet", tmp_path / ".rows.parquet.parts"
+    left.mkdir()
+    for file in (left / "0", left / "7", tmp_path / ".rows.parquet.part"):
+        file.write_bytes(b"half of it")
+    write_sets(path, read_sets(stored_file))
+    assert path.read_bytes() == stored_file.read_bytes()
+    assert [p.name for p in tmp_path.iterdir()] == [path.name]
 
 
 def test_what_is_no_training_set(tmp_path):
