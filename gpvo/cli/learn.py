@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import tempfile
 from collections.abc import Iterator
+from contextlib import contextmanager, suppress
 from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
@@ -166,6 +167,7 @@ def _train(paths: list[Path], config: TrainConfig, update: Path | None, on_fit: 
     from gpvo.learning import train as learning
 
     refuse_twice(paths)
+    config.refuse_unknown()
     if config.regressor != "auto" and config.target != "position":
         note("gpvo: --regressor applies only to --target position; the log-variance GP is always sparse")
     if update is not None and config.target == "position":
@@ -175,17 +177,32 @@ def _train(paths: list[Path], config: TrainConfig, update: Path | None, on_fit: 
             raise GpvoError("a file of training rows must be given alone", where=paths[0], cure="or give run folders")
         return store.train_stored(paths[0], config, on_fit=on_fit)
     runs = _rows(paths, config)
-    if config.target == "position":
-        return learning.train_position(list(runs), config)
     if update is not None:
         return store.update(update, runs, config, tell=lambda what: note(f"gpvo: {what}"), on_fit=on_fit)
     frames = (read_meta(p).get("frames") or 0 for p in paths if (p / "run.json").is_file())  # as the runs say
     if sum(map(int, frames)) > config.max_rows:
         # They do not fit into memory together: their rows pass through a file, one run at a time.
-        with tempfile.TemporaryDirectory(prefix="gpvo-") as folder:
-            write_sets(rows := Path(folder) / "rows.parquet", runs)
+        with _file_of_rows(config.keep) as rows:
+            write_sets(rows, runs)
             return store.train_stored(rows, config, on_fit=on_fit)
     return learning.train_sets(list(runs), config, on_fit=on_fit)
+
+
+@contextmanager
+def _file_of_rows(keep: str | None) -> Iterator[Path]:
+    """A file for as long as the context is open: among the folds that are kept, if any are, where the next call
+    replaces one that a killed process left."""
+    if keep is None:
+        with tempfile.TemporaryDirectory(prefix="gpvo-") as folder:
+            yield Path(folder) / "rows.parquet"
+        return
+    rows = Path(keep) / "rows.parquet"
+    try:
+        yield rows
+    finally:
+        rows.unlink(missing_ok=True)
+        with suppress(OSError):  # it holds folds
+            rows.parent.rmdir()
 
 
 def _print_table(document: dict[str, Any]) -> None:

@@ -68,6 +68,15 @@ class TrainConfig:
         left_out = ("jobs", "backend", "scheduler", "keep", *(["time_offset_s"] if self.time_offset_s == 0.0 else []))
         return {k: v for k, v in asdict(self).items() if k not in left_out}
 
+    def refuse_unknown(self) -> None:
+        """Raise GpvoError, before rows are made, for features or a regressor that there are not."""
+        from gpvo.learning.regressors import get_regressor
+
+        if self.features != "auto":
+            resolve(self.features)
+        if self.target == "position":
+            get_regressor(self.regressor)
+
     def rows_of(self, run: TrainingSet | Run | str | Path) -> TrainingSet:
         """The training set of a run, or of its folder, under these settings; one that is made already is returned."""
         from gpvo.dataset.build import TrainingSet, build_run  # of odometry, which the options alone do not need

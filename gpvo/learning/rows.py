@@ -25,9 +25,8 @@ from gpvo.types import Array
 _STRETCH, _CLEARLY = 10, 100.0
 
 
-def checked(sets: Sequence[TrainingSet], target: str) -> list[TrainingSet]:
-    """With different names, errors on every axis, and covariances that errors can be held against. Raises GpvoError
-    where they do not belong together."""
+def of_target(sets: Sequence[TrainingSet], target: str) -> list[TrainingSet]:
+    """With different names. Raises GpvoError where there is none, or one of another target."""
     if not sets:
         raise GpvoError("there is no run to train on", cure="gpvo train RUN... -o MODEL")
     other = next((s for s in sets if s.target != target), None)
@@ -35,8 +34,14 @@ def checked(sets: Sequence[TrainingSet], target: str) -> list[TrainingSet]:
         cure = f"--target {other.target}"
         raise GpvoError(f"holds rows of the target '{other.target}', not '{target}'", where=other.name, cure=cure)
     names = [s.name for s in sets]
-    if len(set(names)) < len(names):
-        sets = [replace(s, name=f"{s.name}#{i}") if names.count(s.name) > 1 else s for i, s in enumerate(sets)]
+    return [replace(s, name=f"{s.name}#{i}") if names.count(s.name) > 1 else s for i, s in enumerate(sets)]
+
+
+def checked(sets: Sequence[TrainingSet], target: str) -> list[TrainingSet]:
+    """With different names, errors on every axis, and covariances that errors can be held against. Raises GpvoError
+    where they do not belong together."""
+    names = [s.name for s in sets]
+    sets = of_target(sets, target)
     # A motion spans several frames where odometry kept its reference; the shortest ones span one. How long a window
     # of path takes is a matter of speed.
     steps = [float(np.quantile(s.dt_s, 0.1)) for s in sets]

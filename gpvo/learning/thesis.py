@@ -19,7 +19,7 @@ from numpy.typing import ArrayLike, NDArray
 from gpvo.dataset.build import TrainingSet
 from gpvo.errors import ModelError
 from gpvo.learning.config import supported_columns
-from gpvo.learning.regressors import get_regressor
+from gpvo.learning.regressors import ON_ALL_ROWS, get_regressor
 from gpvo.online import modelfile
 from gpvo.online.features import THESIS
 from gpvo.online.projected import ProjectedGP
@@ -119,7 +119,7 @@ def fit_thesis(
     scale = np.maximum(Y.std(axis=0), 1e-12)
     U, Y = (X - centre) / spread, Y / scale
     if shared:
-        points = {} if regressor in ("exact", "sklearn") else {"inducing": inducing}
+        points = {} if regressor in ON_ALL_ROWS else {"inducing": inducing}
         fits = [get_regressor(regressor, n_rows=len(X), isotropic=True, **points).fit(U, Y, seed=seed)]
     else:
         from gpvo.learning.regressors.sparse import SparseRegressor  # with torch, which reading a model does without

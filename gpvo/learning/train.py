@@ -25,7 +25,7 @@ from gpvo.learning.config import TrainConfig
 from gpvo.learning.fit import NONE, Learned, fit_model
 from gpvo.learning.methods import METHODS, average, empty, method_arrays, score, simple_covariances, stated_and_actual
 from gpvo.learning.regressors.numerics import fixed_threads
-from gpvo.learning.rows import checked
+from gpvo.learning.rows import checked, of_target
 from gpvo.learning.sample import draw_sample
 from gpvo.learning.thesis import ThesisModel, fit_thesis
 from gpvo.online import modelfile
@@ -82,6 +82,8 @@ def train_sets(
     sets: Sequence[TrainingSet], config: TrainConfig, *, judge: bool = True, on_fit: OnFit = lambda done, total: None
 ) -> TrainedModel:
     """The same from training sets. ``judge`` False leaves the table out."""
+    if config.target == "position":
+        return _train_position(of_target(sets, config.target), config, judge, on_fit)
     sets = checked(sets, config.target)
     table = train_table(sets, config, on_fit) if judge else {}
     learned, thesis = fit_model(sets, config), fit_thesis(sets, seed=config.seed)
@@ -120,21 +122,9 @@ def train_table(
     more than :data:`MOST_FOLDS`. For a single sequence, blocks of time are left out: they say less, and have no
     intervals; see ``folds_are``.
     """
-    parts = sets if len(sets) > 1 else time_blocks(sets[0])
-    jobs = [(held_out, train_on, config) for held_out, train_on in leave_out(parts, MOST_FOLDS) if train_on]
-    done, total = count(1), len(jobs) + 1  # the model itself comes last
-    on_fit(0, total)
-    judged = map_jobs(
-        _kept_fold,
-        jobs,
-        jobs=config.jobs,
-        backend=config.backend,
-        scheduler=config.scheduler,
-        on_done=lambda: on_fit(next(done), total),
-    )
-    if not judged:
+    folds = _folds(sets if len(sets) > 1 else time_blocks(sets[0]), config, on_fit)
+    if not folds:
         return {"folds": [], "folds_are": None, "mean": {m: empty() for m in METHODS}, "comparison": None}
-    folds = [judged[k % len(jobs)][k // len(jobs)] for k in range(len(parts))]
     mean = {m: average([f["methods"][m] for f in folds]) for m in METHODS}
     comparison = _compare(folds, mean)
     if len(sets) == 1:  # blocks of one flight are no sample of flights
@@ -146,6 +136,22 @@ def train_table(
         "mean": mean,
         "comparison": comparison,
     }
+
+
+def _folds(parts: Sequence[TrainingSet], config: TrainConfig, on_fit: OnFit) -> list[dict[str, Any]]:
+    """Each part's line of the table, from a fit without it; none of a part alone."""
+    jobs = [(held_out, train_on, config) for held_out, train_on in leave_out(parts, MOST_FOLDS) if train_on]
+    done, total = count(1), len(jobs) + 1  # the model itself comes last
+    on_fit(0, total)
+    judged = map_jobs(
+        _kept_fold,
+        jobs,
+        jobs=config.jobs,
+        backend=config.backend,
+        scheduler=config.scheduler,
+        on_done=lambda: on_fit(next(done), total),
+    )
+    return [judged[k % len(jobs)][k // len(jobs)] for k in range(len(parts) if jobs else 0)]
 
 
 def time_blocks(s: TrainingSet) -> list[TrainingSet]:
@@ -188,6 +194,8 @@ def _fold(
 ) -> list[dict[str, Any]]:
     """All methods fitted without some sequences and scored on each of these; the fitted ones go into the file
     ``model``."""
+    if config.target == "position":
+        return _position_fold(held_out, _fit_position(train_on, config))
     arrays, thesis = method_arrays(train_on), fit_thesis(train_on, seed=config.seed)
     learned = fit_model(train_on, config)
     if model is not None:
@@ -331,18 +339,11 @@ def _header(
     }
 
 
-def train_position(sets: Sequence[TrainingSet], config: TrainConfig, *, judge: bool = True) -> TrainedModel:
+def _train_position(sets: Sequence[TrainingSet], config: TrainConfig, judge: bool, on_fit: OnFit) -> TrainedModel:
     """The thesis' model of positions: a GP of the residuals (n, 3) [m] on velocity and feature count, isotropic;
     ``features="auto"`` means these."""
-    model = _fit_position(sets, config)
-    parts = leave_out(sets, MOST_FOLDS) if judge and len(sets) > 1 else ()
-    fitted = [_fit_position(others, config) for _, others in parts]
-    folds: list[dict[str, Any]] = []
-    for k, s in enumerate(sets if fitted else ()):
-        of_others = fitted[k % len(fitted)]
-        stated = of_others.predict(s.select(of_others.columns))
-        methods: dict[str, Any] = {m: empty() for m in METHODS} | {"gp_thesis": score(s.Y, *stated)}
-        folds.append({"held_out": s.name, "rows": len(s), "lost": s.counts["lost"], "methods": methods})
+    model = _fit_position(sets, config)  # before the folds: a regressor may refuse so many rows
+    folds = _folds(sets, config, on_fit) if judge else []
     X = np.concatenate([s.select(model.columns) for s in sets])
     X = X[np.isfinite(X).all(axis=1)]
     header = {
@@ -353,6 +354,15 @@ def train_position(sets: Sequence[TrainingSet], config: TrainConfig, *, judge: b
     mean = {m: average([f["methods"][m] for f in folds]) if folds else empty() for m in METHODS}
     table = {"schema": 1, "model": None, "features": header["features"], "folds": folds, "mean": mean}
     return TrainedModel(model.to_arrays(), header, {**table, "comparison": None}, sets)
+
+
+def _position_fold(held_out: Sequence[TrainingSet], of_others: ThesisModel) -> list[dict[str, Any]]:
+    folds: list[dict[str, Any]] = []
+    for s in held_out:
+        stated = of_others.predict(s.select(of_others.columns))
+        methods: dict[str, Any] = {m: empty() for m in METHODS} | {"gp_thesis": score(s.Y, *stated)}
+        folds.append({"held_out": s.name, "rows": len(s), "lost": s.counts["lost"], "methods": methods})
+    return folds
 
 
 def _fit_position(sets: Sequence[TrainingSet], config: TrainConfig) -> ThesisModel:

@@ -14,7 +14,7 @@ from gpvo.dataset.build import TrainingSet, build_run
 from gpvo.files import write_arrays
 from gpvo.io.run import read_run
 from gpvo.learning.config import TrainConfig
-from gpvo.learning.train import train_position, train_sets
+from gpvo.learning.train import train_sets
 from gpvo.online import modelfile
 from gpvo.online.features import resolve
 from gpvo.online.predictor import Predictor
@@ -48,7 +48,7 @@ class ModelJob:
         if self.kind == "position":
             config = TrainConfig(features="thesis", target="position")
             sets = [build_run(read_run(p), target="position") for p in self.runs]
-            trained = train_position(sets, config, judge=False)
+            trained = train_sets(sets, config, judge=False)
         else:
             sets = sets_of(self.runs, self.lacking)
             trained = train_sets(sets, TrainConfig(features=self.features), judge=False)

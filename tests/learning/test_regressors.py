@@ -150,6 +150,10 @@ def test_choice_by_name(monkeypatch: pytest.MonkeyPatch) -> None:
     assert {"exact", "sparse", "svgp", "sklearn"} <= set(regressor_names())
     with pytest.raises(GpvoError, match=r"unknown regressor 'magic'.*exact, sparse"):
         get_regressor("magic")
+    for name in ("exact", "sklearn"):
+        assert get_regressor(name, n_rows=10_000).name == name
+        with pytest.raises(GpvoError, match=f"'{name}' learns from at most 10,000 rows, and these are 100,000"):
+            get_regressor(name, n_rows=100_000)
 
 
 def test_regressors_of_other_packages_join(monkeypatch: pytest.MonkeyPatch) -> None:

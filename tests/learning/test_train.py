@@ -38,6 +38,7 @@ from gpvo.learning.store import (
     picture_path,
     rows_path,
     save_model,
+    train_stored,
     update,
 )
 from gpvo.learning.train import TrainedModel, _slips, train_sets, unseen_axes
@@ -468,7 +469,7 @@ def test_positions_of_runs_of_one_name_are_judged_by_the_other_parts(monkeypatch
     monkeypatch.setattr(training, "MOST_FOLDS", 2)
     config = TrainConfig(target="position")
     sets = [build(*make_run(k, n=60), name="run", target="position") for k in range(3)]
-    folds = training.train_position(sets, config).table["folds"]
+    folds = train_sets(sets, config).table["folds"]
     for k, (fold, s) in enumerate(zip(folds, sets, strict=True)):
         model = training._fit_position([other for i, other in enumerate(sets) if i % 2 != k % 2], config)
         found = score(s.Y, *model.predict(s.select(model.columns)))
@@ -476,13 +477,41 @@ def test_positions_of_runs_of_one_name_are_judged_by_the_other_parts(monkeypatch
         assert size_m == pytest.approx(found["rmse_corrected"]["translation_m"], rel=1e-9)
 
 
+def test_rows_that_are_streamed_leave_nothing_behind_and_names_are_judged_before_they_are_made(tmp_path):
+    config = TrainConfig(target="position", max_rows=1000, keep=str(tmp_path / "kept"))
+    for k in range(2):
+        log, truth = make_run(k, n=600)
+        write_run(tmp_path / str(k), log, truth=truth)
+    trained = _train([tmp_path / "0", tmp_path / "1"], config, None, lambda done, total: None)
+    assert trained.header["rows"]["in_memory"] <= 1000 < trained.header["rows"]["given"]
+    assert {p.suffix for p in (tmp_path / "kept").iterdir()} == {".json"}
+    for wrong in ({"features": "magic"}, {"regressor": "magic"}):
+        with pytest.raises(GpvoError, match=f"unknown {next(iter(wrong)).rstrip('s')} 'magic'"):
+            _train([tmp_path / "none"], replace(config, **wrong), None, lambda done, total: None)
+
+
+def test_positions_are_trained_from_stored_rows_and_go_on_from_finished_folds_too(tmp_path, monkeypatch):
+    sets = [build(*make_run(k, n=60), name=str(k), target="position") for k in range(3)]
+    config = TrainConfig(target="position")
+    whole = train_sets(sets, config)
+    write_sets(tmp_path / "rows.parquet", sets)
+    with pytest.raises(GpvoError, match="--target position"):
+        train_stored(tmp_path / "rows.parquet", QUICK)
+    config, fits = replace(config, keep=str(tmp_path / "kept")), []
+    stored = train_stored(tmp_path / "rows.parquet", config, on_fit=lambda done, total: fits.append((done, total)))
+    assert fits == [(k, 4) for k in range(4)]
+    assert stored.table == whole.table
+    assert all((stored.arrays[name] == values).all() for name, values in whole.arrays.items())
+    monkeypatch.setattr(training, "_position_fold", None)
+    assert train_stored(tmp_path / "rows.parquet", config).table == whole.table
+
+
 def test_position_target_has_its_own_type(tmp_path):
     from gpvo.dataset.build import build
     from gpvo.learning.thesis import ThesisModel
-    from gpvo.learning.train import train_position
 
     sets = [build(*make_run(k, n=100), name=str(k), target="position") for k in range(3)]
-    trained = train_position(sets, TrainConfig(target="position"))
+    trained = train_sets(sets, TrainConfig(target="position"))
     assert trained.table["mean"]["gp_thesis"]["rmse_raw"]["translation_m"] > 0
     save_model(trained, tmp_path / "p.gpvo")
     with pytest.raises(ModelError, match="residual of a position.*--target frame"):

@@ -106,8 +106,11 @@ def checked(X: Array, Y: Array) -> tuple[Array, Array]:
 
 __all__ = ["FittedGP", "Hyperparameters", "Regressor", "get_regressor", "regressor_names"]
 
-EXACT_ROWS = 2000
-"""Above this many rows ``auto`` takes ``sparse``."""
+ON_ALL_ROWS = ("exact", "sklearn")
+"""Those whose time grows with the cube of the rows."""
+EXACT_ROWS, MOST_EXACT_ROWS = 2000, 10_000
+"""Above this many rows ``auto`` takes ``sparse``, and those of :data:`ON_ALL_ROWS` are refused: ten thousand take an
+hour or so, a hundred thousand 80 GB for each matrix."""
 
 _BUILT_IN = {
     "exact": "gpvo.learning.regressors.sparse:exact",
@@ -132,11 +135,14 @@ def get_regressor(name: str, *, n_rows: int | None = None, **options: Any) -> Re
 
     ``options`` go to the regressor: all take ``isotropic``, ``threads`` and ``hyper`` (fixed hyperparameters);
     ``sparse`` and ``svgp`` also ``inducing``; ``svgp`` ``device`` ("auto", "cpu", "cuda"). Raises GpvoError for
-    unknown names.
+    unknown names, and where ``n_rows`` are more than it can learn from.
     """
     if name == "auto":
         name = "exact" if n_rows is not None and n_rows <= EXACT_ROWS else "sparse"
     known = plugins("gpvo.regressors", _BUILT_IN)
     if name not in known:
         raise GpvoError(f"unknown regressor '{name}'", cure=f"one of: auto, {', '.join(regressor_names())}")
+    if name in ON_ALL_ROWS and n_rows is not None and n_rows > MOST_EXACT_ROWS:
+        text = f"'{name}' learns from at most {MOST_EXACT_ROWS:,} rows, and these are {n_rows:,}"
+        raise GpvoError(text, cure="--regressor sparse or svgp")
     return known[name]()(**options)
