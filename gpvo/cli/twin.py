@@ -77,7 +77,8 @@ def twin(
 ) -> None:
     """Simulate runs again, so that their errors are known.
 
-    Each twin is a run folder with exact truth, made from the run's own tracks.
+    Each twin is a run folder with exact truth, made from the run's own tracks. Finished ones are kept where an
+    interrupted command is started again.
 
     Example: gpvo twin runs/mine -o twins --tolerance d455
     """

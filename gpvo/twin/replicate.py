@@ -14,9 +14,12 @@ from numpy.typing import NDArray
 
 from gpvo.cameras.rig import RIG_ERRORS, TOLERANCES, Tolerance, TrueRig
 from gpvo.errors import GpvoError, SourceError
-from gpvo.files import read_toml
+from gpvo.files import digest_of_file, read_toml
 from gpvo.geometry import se3
-from gpvo.io.run import Run, read_run, read_tracks
+from gpvo.io.run import Run, is_finished, read_run, read_tracks
+from gpvo.io.run_folder import OWN
+from gpvo.io.run_read import read_meta
+from gpvo.io.snapshot import digest_of
 from gpvo.io.source import SourceReport
 from gpvo.parallel import map_jobs
 from gpvo.runner import config_of
@@ -222,7 +225,8 @@ def _drawn_noise(original: Original, rng: np.random.Generator) -> Array:
 def make_twins(
     path: Path, out: Path, settings: TwinSettings, *, jobs: int = 1, on_twin: Callable[[], None] = lambda: None
 ) -> list[Path]:
-    """Twins of one run as run folders ``out/NAME-twinK``, by the odometry and the settings of the run.
+    """Twins of one run as run folders ``out/NAME-twinK``, by the odometry and the settings of the run; finished ones of
+    the same run and settings are left as they are.
 
     Raises SourceError as :func:`estimate`, and where the folder holds twins that these would not replace.
     """
@@ -232,14 +236,30 @@ def make_twins(
     if (other := next(others, None)) is not None:
         cure = "remove it, make as many as before, or give another folder"
         raise SourceError(f"is a twin that {settings.replicates} replicates would not replace", where=other, cure=cure)
-    original = estimate(path)
-    work = [(original, settings, k, out) for k in made]
-    return map_jobs(_make_twin, work, jobs=jobs, on_done=on_twin)
+    name, of = read_run(path).name, _digest(path, settings)
+    folders = [out / f"{name}-twin{k}" for k in made]
+    left = [k for k in made if not _is_made(folders[k], of, k)]
+    for _ in range(len(made) - len(left)):
+        on_twin()
+    if left:
+        original = estimate(path)
+        map_jobs(_make_twin, [(original, settings, k, out, of) for k in left], jobs=jobs, on_done=on_twin)
+    return folders
 
 
-def _make_twin(original: Original, settings: TwinSettings, replicate: int, out: Path) -> Path:
+def _digest(path: Path, settings: TwinSettings) -> str:
+    """Of what decides the twins of a run."""
+    return digest_of({p.name: digest_of_file(p) for name in OWN if (p := path / name).is_file()}, asdict(settings))
+
+
+def _is_made(folder: Path, of: str, replicate: int) -> bool:
+    about = read_meta(folder).get("twin") if is_finished(folder) else None
+    return isinstance(about, dict) and (about.get("digest"), about.get("replicate")) == (of, replicate)
+
+
+def _make_twin(original: Original, settings: TwinSettings, replicate: int, out: Path, of: str) -> Path:
     source = twin_source(original, settings, replicate)
-    about = {**asdict(settings), "of": original.run.name, "replicate": replicate}
+    about = {**asdict(settings), "of": original.run.name, "replicate": replicate, "digest": of}
     about["common_variance_px2"] = original.common.about()
     conditions, truth = _Conditions(original), source.truth
     factor = np.ones(6) if settings.gap is None else settings.gap.factors(settings.replicates)[replicate]

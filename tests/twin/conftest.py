@@ -18,10 +18,10 @@ def each_twin_once(tmp_path_factory: pytest.TempPathFactory) -> Iterator[None]:
     made: dict[tuple[Path, TwinSettings, int], Path] = {}
     make = replicate._make_twin
 
-    def once(original: Original, settings: TwinSettings, k: int, out: Path) -> Path:
+    def once(original: Original, settings: TwinSettings, k: int, out: Path, of: str) -> Path:
         key = (original.run.path, settings, k)
         if key not in made:
-            made[key] = make(original, settings, k, tmp_path_factory.mktemp("made"))
+            made[key] = make(original, settings, k, tmp_path_factory.mktemp("made"), of)
         return Path(shutil.copytree(made[key], out / made[key].name, dirs_exist_ok=True))
 
     with pytest.MonkeyPatch.context() as patch:

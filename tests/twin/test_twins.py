@@ -1,6 +1,7 @@
 """Twins of simulated flights: the same conditions, other noise, exact truth; and the commands around them."""
 
 import json
+import shutil
 import warnings
 from dataclasses import asdict, replace
 
@@ -16,6 +17,7 @@ from gpvo.io import open_source
 from gpvo.io.run import copy_run, read_run
 from gpvo.runner import run
 from gpvo.sim.points import simulate_points
+from gpvo.twin import replicate
 from gpvo.twin.gap import Gap, pooled, read_gap
 from gpvo.twin.replicate import TwinSettings, estimate, make_twins, read_tolerance, rig_errors, twin_source
 from gpvo.types import StereoCamera
@@ -55,6 +57,27 @@ def test_twins_err_as_much_as_the_flight_did(flown):
     # 150 motions: a standard deviation is known to 6 %, more or less by their correlation.
     assert ((ratio > 0.7) & (ratio < 1.4)).all()
     assert abs(np.log(ratio).mean()) < 0.15
+
+
+def test_finished_twins_of_the_same_run_and_settings_are_kept(flown, tmp_path, monkeypatch):
+    shutil.copytree(flown[0] / "twins", tmp_path / "twins")
+    shutil.rmtree(tmp_path / "twins" / "run-twin1")
+    make, made, told, all_three = replicate._make_twin, [], [], [0, 1, 2]
+    monkeypatch.setattr(replicate, "_make_twin", lambda *of: made.append(of[2]) or make(*of))
+    for seed, wanted in ((0, [1]), (0, []), (1, all_three)):
+        settings = TwinSettings(replicates=3, seed=seed)
+        found = make_twins(flown[0] / "run", tmp_path / "twins", settings, on_twin=lambda: told.append(1))
+        assert found == [tmp_path / "twins" / f"run-twin{k}" for k in all_three]
+        assert made == wanted
+        if seed == 0:
+            again = [read_run(p).log.trajectory() for p in found]
+            assert [a.tobytes() for a in again] == [t.log.trajectory().tobytes() for t in flown[2]]
+        made.clear()
+    assert len(told) == 9
+    shutil.copytree(flown[0] / "run", tmp_path / "run")
+    (tmp_path / "run" / "config.toml").write_text((tmp_path / "run" / "config.toml").read_text() + "# other\n")
+    make_twins(tmp_path / "run", tmp_path / "twins", settings)
+    assert made == all_three
 
 
 def test_twins_see_what_the_flight_saw(flown):
