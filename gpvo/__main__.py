@@ -9,9 +9,18 @@ from typing import NoReturn
 
 from gpvo.cameras.imagesize import MAX_PIXELS
 
+_heard: list[int] = []
+
+
+def _interrupt(number: int, _frame: object) -> NoReturn:
+    """Ctrl-C, as Python itself does it, and remembered."""
+    _heard.append(number)
+    raise KeyboardInterrupt
+
 
 def _terminate(number: int, _frame: object) -> NoReturn:
     """End as by Ctrl-C: worker processes and temporary folders go too. A second signal ends the process at once."""
+    _heard.append(number)
     from gpvo.parallel import after_first
 
     signal.signal(number, after_first(number))
@@ -34,6 +43,8 @@ def main() -> None:
 
         for number in ending_signals():
             signal.signal(number, _terminate)
+        if signal.getsignal(signal.SIGINT) is signal.default_int_handler:
+            signal.signal(signal.SIGINT, _interrupt)
         try:
             from gpvo.cli import main as run
         except ModuleNotFoundError as error:
@@ -45,6 +56,13 @@ def main() -> None:
     except KeyboardInterrupt:  # also while all this is loaded
         print("gpvo: interrupted", file=sys.stderr)
         sys.exit(130)
+    except Exception:
+        if not _heard:
+            raise
+        # A library that was being loaded said of the signal that it cannot be.
+        if _heard[0] == signal.SIGINT:
+            print("gpvo: interrupted", file=sys.stderr)
+        sys.exit(128 + _heard[0])
     finally:  # all is written: a signal while Python winds down its worker processes would print a traceback
         signal.signal(signal.SIGINT, signal.SIG_IGN)
         from gpvo.parallel import after_first, ending_signals  # anew where Ctrl-C came while it was loaded

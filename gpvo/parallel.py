@@ -10,7 +10,7 @@ import warnings
 from collections import deque
 from collections.abc import Callable, Generator, Iterable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
-from contextlib import suppress
+from contextlib import contextmanager, suppress
 from itertools import starmap
 from typing import Any, TypeVar
 
@@ -71,9 +71,28 @@ def map_jobs(
         warnings.filterwarnings("ignore", "A worker stopped while some jobs", UserWarning)
         bound = {"initializer": _serve, "initargs": (os.getpid(),)}
         try:
-            return _told(Parallel(n_jobs=jobs, return_as="generator", **bound)(calls), on_done)
+            with _heeding_no_ctrl_c():
+                results = Parallel(n_jobs=jobs, return_as="generator", **bound)(calls)
+            return _told(results, on_done)
         except BrokenProcessPool:
             raise GpvoError(_KILLED, cure="run it again, with fewer --jobs") from None
+
+
+@contextmanager
+def _heeding_no_ctrl_c() -> Iterator[None]:
+    """Until the end of the block, where workers are started: Ctrl-C reaches them too, and each that still loads what it
+    runs on would print a traceback. They inherit that it has to wait."""
+    if not hasattr(signal, "pthread_sigmask"):  # Windows
+        yield
+        return
+    from multiprocessing.resource_tracker import ensure_running
+
+    ensure_running()  # which, if it were to begin inside, would let it through
+    before = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
+    try:
+        yield
+    finally:
+        signal.pthread_sigmask(signal.SIG_SETMASK, before)
 
 
 def _serve(master: int) -> None:

@@ -120,6 +120,43 @@ def test_a_signal_after_the_work_is_done_says_nothing(how: signal.Signals) -> No
     assert err == b""
 
 
+LOADING = """
+import os, signal, time
+import gpvo.cli
+from gpvo.__main__ import main
+
+def load():
+    try:
+        os.kill(os.getpid(), signal.SIGINT)
+        time.sleep(9)
+    except KeyboardInterrupt:
+        raise ImportError("initialization failed") from None
+
+gpvo.cli.main = load
+main()
+"""
+
+
+def test_a_library_that_takes_ctrl_c_for_an_error_is_not_believed() -> None:
+    """As those of pybind11 do while they are loaded."""
+    with start(sys.executable, "-c", LOADING) as call:
+        assert call.communicate(timeout=60)[1] == b"gpvo: interrupted\n"
+    assert call.returncode == 130
+
+
+BLOCKED = """
+import signal
+from gpvo.parallel import map_jobs
+blocked = map_jobs(signal.pthread_sigmask, [(signal.SIG_BLOCK, [])] * 2, jobs=2)
+print([signal.SIGINT in of for of in (*blocked, signal.pthread_sigmask(signal.SIG_BLOCK, []))])
+"""
+
+
+def test_ctrl_c_waits_in_workers_from_before_they_load_anything() -> None:
+    with start(sys.executable, "-c", BLOCKED) as call:
+        assert call.communicate(timeout=120)[0] == b"[True, True, False]\n"
+
+
 def bytes_of(path: Path) -> dict[str, bytes]:
     files = [path] if path.is_file() else [p for p in path.rglob("*") if p.is_file()]
     return {str(p.relative_to(path)): p.read_bytes() for p in files}
