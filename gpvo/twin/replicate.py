@@ -150,7 +150,7 @@ def twin_source(original: Original, settings: TwinSettings, replicate: int) -> T
     rng = np.random.default_rng([settings.seed, replicate, 29])
     pixels = _projected(original, settings, replicate)
     noise = _drawn_noise(original, rng)
-    if original.common.variance_px2.any():
+    if original.common:
         drawn = original.common.draw(seen, np.random.default_rng([settings.seed, replicate, 37]))
         noise += np.where(original.structure.weight[:, None] > 0, drawn, 0.0)
     uv_left, uv_right = pixels[0] + noise[:, :2], pixels[1] + noise[:, :2] - noise[:, 2:] * [1.0, 0.0]

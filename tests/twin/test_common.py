@@ -68,8 +68,20 @@ def test_size_of_a_field_is_found(kind):
     assert (np.delete(square, same, axis=0).sum(axis=0) < np.square([0.05, 0.04])).all()
 
 
+def test_size_of_what_points_of_one_depth_share_is_found():
+    """In this flight depth and place in the image are unrelated, so no function of the place shows it."""
+    near = common({"white": (0.3, 0.0)})
+    field = replace(near, variance_px2=np.zeros((len(KINDS), 2)), near_px2=near.variance_px2)
+    each = [found(*flight(seed, 300, field)) for seed in range(3)]
+    square = np.mean([f.near_px2 for f in each], axis=0)
+    # Less by what the draws hold of it already, point by point.
+    assert 0.65 < np.sqrt(square[1, 0]) / 0.3 < 1.2
+    assert np.sqrt(square[:, 1].sum()) < 0.05
+    assert np.sqrt(np.mean([f.variance_px2 for f in each], axis=0).sum()) < 0.05
+
+
 def test_independent_noise_makes_no_field():
-    none = [not found(*flight(seed, 150), seed).variance_px2.any() for seed in range(12)]
+    none = [not found(*flight(seed, 150), seed) for seed in range(12)]
     # One in a hundred is beyond all draws by chance.
     assert sum(none) >= 11
 
@@ -109,7 +121,7 @@ def clean(tmp_path_factory):
 
 def test_twins_without_a_field_are_those_of_independent_noise(clean):
     _, original = clean
-    assert not original.common.variance_px2.any()
+    assert not original.common
     assert original.common.about() == {}
     known = replace(original, common=common({"white": (0.1, 0.1)}, original.common.step_s))
     with_field, again, without = (twin_source(o, TwinSettings(), 1).frames for o in (known, known, original))
