@@ -101,23 +101,26 @@ def replacing(path: Path, own: Own | None = None) -> Iterator[Path]:
 
 def _part(path: Path) -> tuple[int, Path]:
     """An empty file beside ``path``, and the handle that keeps it from other writers: always of one name, so that
-    processes that are killed leave no more than one, or of a new one where that is in use or cannot be locked."""
+    processes that are killed leave no more than one; or of a new one, which needs no handle (-1), where that is in use
+    or cannot be locked."""
     part = path.with_name(f".{path.name}.part")
     if fcntl is not None:
         handle = -1
         try:
             handle = os.open(part, os.O_RDWR | os.O_CREAT | os.O_NOFOLLOW, 0o600)
             fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
-            os.fchmod(handle, 0o600)  # nobody else's
             if os.path.samestat(os.fstat(handle), os.stat(part)):  # else a writer put it in place before it was locked
+                os.fchmod(handle, 0o600)  # nobody else's
                 os.ftruncate(handle, 0)
                 return handle, part
-        except OSError:
-            pass  # mkstemp tells, if it is no matter of this one name
+        except OSError as error:  # mkstemp tells, if it is no matter of this one name
+            if handle >= 0 and not isinstance(error, (BlockingIOError, PermissionError)):
+                part.unlink(missing_ok=True)  # nothing can be locked on this disk
         if handle >= 0:
             os.close(handle)
-    made = tempfile.mkstemp(dir=path.parent, prefix=f".{path.name}.", suffix=".part")
-    return made[0], Path(made[1])
+    handle, name = tempfile.mkstemp(dir=path.parent, prefix=f".{path.name}.", suffix=".part")
+    os.close(handle)  # Windows replaces no open file
+    return -1, Path(name)
 
 
 def refuse_foreign(path: Path, mark: bytes, what: str) -> None:

@@ -85,9 +85,12 @@ def _heeding_no_ctrl_c() -> Iterator[None]:
     if not hasattr(signal, "pthread_sigmask"):  # Windows
         yield
         return
-    from multiprocessing.resource_tracker import ensure_running
+    from multiprocessing import resource_tracker
 
-    ensure_running()  # which, if it were to begin inside, would let it through
+    from joblib.externals.loky.backend import resource_tracker as of_workers
+
+    for tracker in (resource_tracker, of_workers):
+        tracker.ensure_running()  # which, if it were to begin inside, would let it through
     before = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
     try:
         yield

@@ -54,6 +54,8 @@ def _pieces(whole: Path) -> Iterator[Path]:
     """An empty folder beside a file that is being written, in place of one that a killed process left."""
     folder = whole.with_name(f"{whole.name}s")
     try:
+        if folder.is_symlink():
+            folder.unlink()
         shutil.rmtree(folder, ignore_errors=True)
         yield make_folder(folder)
     finally:

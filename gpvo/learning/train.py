@@ -141,7 +141,7 @@ def train_table(
 def _folds(parts: Sequence[TrainingSet], config: TrainConfig, on_fit: OnFit) -> list[dict[str, Any]]:
     """Each part's line of the table, from a fit without it; none of a part alone."""
     jobs = [(held_out, train_on, config) for held_out, train_on in leave_out(parts, MOST_FOLDS) if train_on]
-    done, total = count(1), len(jobs) + 1  # the model itself comes last
+    done, total = count(1), len(jobs) + 1  # and the model itself
     on_fit(0, total)
     judged = map_jobs(
         _kept_fold,

@@ -82,6 +82,8 @@ class CommonField:
         sums = _block_sums(S, told, lengths)
         weights = _weights(N, lengths)
         energy = _energies(sums, weights)
+        varies = energy.std(axis=0) > 0  # not so nearness, where all points are equally far away
+        energy = energy[:, varies]
         total = (energy / energy.std(axis=0)).sum(axis=1)
         if total[0] > total[1:].max() and (energy[0] / energy[1:].mean(axis=0)).mean() > _WORTH:
             scatter, rng = energy[1:].std(axis=0), np.random.default_rng(29)
@@ -90,7 +92,8 @@ class CommonField:
                 if _TAU_S[kind] <= lengths[-1] * step_s:  # longer than the blocks, it could not be told
                     c = _drawn(kind, (len(S), _FIELDS, 3 * _TERMS), step_s, rng) * _CHANNELS[channel]
                     c = np.diff(c, axis=0, prepend=0.0) if kind == 0 else c * pace[:, None, None]
-                    units[kind, channel] = _energies(_block_sums(c @ N, told, lengths), weights).mean(axis=0) / scatter
+                    seen_of_it = _energies(_block_sums(c @ N, told, lengths), weights).mean(axis=0)
+                    units[kind, channel] = seen_of_it[varies] / scatter
             excess = (energy[0] - energy[1:].mean(axis=0)) / scatter
             variance = nnls(units.reshape(-1, len(scatter)).T, excess)[0].reshape(variance.shape)
         return cls(variance[:, :2], step_s, pace, variance[:, 2:])
@@ -212,7 +215,10 @@ def _modes(
         # Huber's weights: the same for a residual and its opposite, so for all draws.
         w = np.minimum(1.0, _LARGEST / np.maximum(np.linalg.norm(run, axis=1), 1e-9))[:, None, None]
         A = w * (W @ J @ pose_jacobian(P[b]))
-        F = (w * (W[:, :, None] * B[b, None, None, :]).reshape(len(a), 3, n)).reshape(-1, n)
+        place = B[b]
+        # Of both views: the noise of one is in the residual, too, and what depends on it would look like a field.
+        place[:, -1] = 0.5 * (B[a, -1] + B[b, -1])
+        F = (w * (W[:, :, None] * place[:, None, None, :]).reshape(len(a), 3, n)).reshape(-1, n)
         Q = np.linalg.qr(A.reshape(-1, 6))[0]
         F -= Q @ (Q.T @ F)
         by_point = np.swapaxes(w * F.reshape(-1, 3, n), 1, 2)

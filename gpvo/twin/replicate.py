@@ -18,7 +18,6 @@ from gpvo.files import digest_of_file, read_toml
 from gpvo.geometry import se3
 from gpvo.io.run import Run, is_finished, read_run, read_tracks
 from gpvo.io.run_folder import OWN
-from gpvo.io.run_read import read_meta
 from gpvo.io.snapshot import digest_of
 from gpvo.io.source import SourceReport
 from gpvo.parallel import map_jobs
@@ -253,8 +252,11 @@ def _digest(path: Path, settings: TwinSettings) -> str:
 
 
 def _is_made(folder: Path, of: str, replicate: int) -> bool:
-    about = read_meta(folder).get("twin") if is_finished(folder) else None
-    return isinstance(about, dict) and (about.get("digest"), about.get("replicate")) == (of, replicate)
+    try:
+        about = read_run(folder).meta.get("twin") if is_finished(folder) else None
+    except SourceError:  # damaged
+        return False
+    return about is not None and (about.get("digest"), about.get("replicate")) == (of, replicate)
 
 
 def _make_twin(original: Original, settings: TwinSettings, replicate: int, out: Path, of: str) -> Path:

@@ -205,7 +205,7 @@ class KltFrontend:
         current.strong = len(kept) + new.strong
         if current.strong >= at_least:
             self._reference = current
-        self._new = None
+        self._matched, self._new = (self._nothing, matched[:0]), None
         return len(kept) + new.detected, current.strong
 
     def _expected(self, seen: _Seen, T_prev_cur: Array) -> tuple[Array, Array, Array, Array]:

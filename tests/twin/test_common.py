@@ -22,15 +22,16 @@ STEP_S, LIFE, PER_FRAME = 0.1, 8, 160
 
 
 def flight(
-    seed: int, n_frames: int, field: CommonField | None = None, rests: range = range(0)
+    seed: int, n_frames: int, field: CommonField | None = None, rests: range = range(0), farther: float = 0.0
 ) -> tuple[Observations, Structure]:
     """Tracks of eight frames past which a camera flies forwards, but not in the frames in which it rests, with
-    independent noise of 0.2 px of each image coordinate, and a field."""
+    independent noise of 0.2 px of each image coordinate, and a field. With ``farther``, points are up to so many times
+    farther away every twenty seconds, and disparities are measured with their noise."""
     rng = np.random.default_rng(seed)
     steps = np.cumsum([k not in rests for k in range(n_frames)]) - 1
     T = np.stack([se3.exp([0.002 * k, 0.0, 0.05 * k, 0.0, 0.001 * k, 0.0]) for k in steps])
     begin = np.repeat(np.arange(1 - LIFE, n_frames), PER_FRAME // LIFE + 1)
-    depth = rng.uniform(2.0, 15.0, len(begin))
+    depth = rng.uniform(2.0, 15.0, len(begin)) * (1.0 + farther * np.sin(np.pi * begin * STEP_S / 20.0) ** 2)
     at = np.c_[rng.uniform([-0.7, -0.5], [0.7, 0.5], (len(begin), 2)) * depth[:, None], depth]
     points = transform(T[np.maximum(begin, 0)], at)
     frame, track = (begin + np.arange(LIFE)[:, None]).ravel(), np.tile(np.arange(len(begin)), LIFE)
@@ -42,6 +43,8 @@ def flight(
     noise = 0.2 * rng.standard_normal((len(order), 3)) @ np.linalg.inv(WHITEN).T + (
         0.0 if field is None else field.draw(seen, rng)
     )
+    if farther:
+        seen = replace(seen, uvd=seen.uvd + noise)
     return seen, Structure(T, points, noise, used.astype(float), np.full(n_frames, 0.2), True)
 
 
@@ -84,6 +87,12 @@ def test_independent_noise_makes_no_field():
     none = [not found(*flight(seed, 150), seed) for seed in range(12)]
     # One in a hundred is beyond all draws by chance.
     assert sum(none) >= 11
+
+
+def test_noise_of_disparities_makes_no_field_of_depth():
+    """It is in the residuals, too; more of it is of far points, and these come and go."""
+    none = [not found(*flight(seed, 600, farther=8.0), seed) for seed in range(8)]
+    assert sum(none) >= 7
 
 
 def test_increments_rest_with_the_image():
