@@ -78,6 +78,10 @@ def test_finished_twins_of_the_same_run_and_settings_are_kept(flown, tmp_path, m
     (tmp_path / "run" / "config.toml").write_text((tmp_path / "run" / "config.toml").read_text() + "# other\n")
     make_twins(tmp_path / "run", tmp_path / "twins", settings)
     assert made == all_three
+    made.clear()
+    (tmp_path / "twins" / "run-twin2" / "vo_log.parquet").write_bytes(b"PAR1")
+    make_twins(tmp_path / "run", tmp_path / "twins", settings)
+    assert made == [2]  # which was damaged
 
 
 def test_twins_see_what_the_flight_saw(flown):
