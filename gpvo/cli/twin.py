@@ -87,10 +87,12 @@ def twin(
     settings = options.settings(seed)
     if out is None and not against:
         raise GpvoError("no folder was given for the twins", cure="give a folder with -o, or compare with --against")
-    with status("starting"):
-        from gpvo.dataset.build import aligned
+    real: list[Run] = []
+    if against:  # before the work, not after it
+        with status("starting"):
+            from gpvo.dataset.build import aligned
 
-    real = [aligned(read_run(path), align)[0] for path in runs] if against else []  # before the work, not after it
+        real = [aligned(read_run(path), align)[0] for path in runs]
     if without := [run.path for run in real if run.truth is None]:
         raise GpvoError("has no ground truth to compare twins with", where=without[0], cure="leave out --against")
     for run in real:
