@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import sys
+from array import array
+from collections.abc import Iterable, Iterator
 from dataclasses import asdict
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
@@ -16,7 +18,7 @@ from gpvo.files import refuse_foreign, write_csv
 from gpvo.io.parquet import write_table
 from gpvo.io.run import PREDICTIONS, read_run, write_predictions
 from gpvo.online.predictor import Predictor
-from gpvo.types import StoredPredictions
+from gpvo.types import Prediction
 
 if TYPE_CHECKING:
     from gpvo.evaluation.forecast import Forecast
@@ -53,9 +55,10 @@ def predict(
         for path, target in zip(runs, targets, strict=True):
             run = read_run(path)
             warn_of_misfits(model, predictor, run)
-            predictions = predictor.replay(run.log).stored
-            write_predictions(target, predictions)
-            documents.append({"run": str(path), "file": str(target), **_summary(predictions)})
+            predictor.reset(run.log.camera, vehicle=run.log.vehicle)
+            told = _Summary()
+            write_predictions(target, told.of(p for p in map(predictor.step, run.log) if p is not None))
+            documents.append({"run": str(path), "file": str(target), **told.document()})
             advance()
     if json_:
         print_json({"schema": 1, **({"runs": documents} if len(runs) > 1 else documents[0])})
@@ -69,14 +72,28 @@ def predict(
         print("no motion was measured" if d["in_domain"] is None else known)
 
 
-def _summary(predictions: StoredPredictions) -> dict[str, Any]:
-    told = [(p.sigma, p.in_domain > 0.5) for p in predictions if p.measured]
-    sigma = np.median([s for s, _ in told], axis=0) if told else np.full(6, np.nan)
-    return {
-        "predictions": len(predictions),
-        "in_domain": float(np.mean([inside for _, inside in told])) if told else None,
-        "median_sigma": {"translation_m": sigma[:3], "rotation_rad": sigma[3:]},
-    }
+class _Summary:
+    """What is told of predictions that pass by."""
+
+    def __init__(self) -> None:
+        self._count, self._sigma, self._inside = 0, array("d"), bytearray()
+
+    def of(self, predictions: Iterable[Prediction]) -> Iterator[Prediction]:
+        """The same predictions."""
+        for p in predictions:
+            self._count += 1
+            if p.measured:
+                self._sigma.frombytes(p.sigma.tobytes())
+                self._inside.append(p.in_domain > 0.5)
+            yield p
+
+    def document(self) -> dict[str, Any]:
+        sigma = np.median(np.reshape(self._sigma, (-1, 6)), axis=0) if self._inside else np.full(6, np.nan)
+        return {
+            "predictions": self._count,
+            "in_domain": float(np.mean(list(self._inside))) if self._inside else None,
+            "median_sigma": {"translation_m": sigma[:3], "rotation_rad": sigma[3:]},
+        }
 
 
 def check(model: Model, run: Annotated[Path, "Run folder."], json_: Json = False) -> None:

@@ -111,15 +111,15 @@ class TrainingSet:
 
 def observe(log: VoLog, names: Sequence[str], target: str = "frame") -> tuple[Sequence[VoRecord], Array]:
     """Replay a log: the records as flight judges (or joins) them and their features (N, d)."""
-    observer, X = Observer(names, target, log.camera, log.vehicle), []
+    observer, X = Observer(names, target, log.camera, log.vehicle), bytearray()
 
     def seen() -> Iterator[VoRecord]:
         for record, x in filter(None, map(observer.step, log)):
-            X.append(x)
+            X.extend(x.tobytes())
             yield record
 
     judged = log.judged_as(seen()) if Window.of(target) is None else replace(log, records=list(seen()))
-    return judged.records, np.array(X).reshape(len(X), len(names))
+    return judged.records, np.frombuffer(X).reshape(len(judged.records), len(names))
 
 
 def build(

@@ -18,7 +18,7 @@ from gpvo.online.guard import camera_problems
 from gpvo.online.predictor import Predictor
 from gpvo.types import Array, VoLog, VoRecord
 
-_RATE, _ROWS = 0.2, 8
+_RATE, _ROWS, _AT_ONCE = 0.2, 8, 10_000
 ENOUGH_INSIDE = 0.8
 """A model fits a run if at least this share of its frames lies in the training domain; in a vehicle's next flight of
 the same kind, a tenth may lie outside."""
@@ -60,8 +60,10 @@ def check(predictor: Predictor, run: Run) -> Check:
     missing = [n for n, lacks in zip(predictor.features, _mean(~np.isfinite(X))) if lacks > 0.5]
     if missing:
         problems.append(f"the run lacks features the model needs: {', '.join(missing)}")
-    place = predictor.model.locate(X, seen.column("dt_s")[seen.usable])
-    inside, beyond = float(_mean(place.in_domain > 0.5)), _mean(predictor.model.domain.outside(X))
+    dt_s, at = seen.column("dt_s")[seen.usable], range(0, len(X), _AT_ONCE)
+    places = [predictor.model.locate(X[k : k + _AT_ONCE], dt_s[k : k + _AT_ONCE]).in_domain > 0.5 for k in at]
+    inside = float(_mean(np.concatenate(places or [np.zeros(0, bool)])))
+    beyond = _mean(predictor.model.domain.outside(X))
     order = np.argsort(-beyond, kind="stable")[:3]
     farthest = tuple((predictor.features[i], float(beyond[i])) for i in order if beyond[i] > 0)
     if inside < ENOUGH_INSIDE:

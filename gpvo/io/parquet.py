@@ -9,11 +9,12 @@ from __future__ import annotations
 
 import struct
 import zlib
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from tempfile import SpooledTemporaryFile
+from typing import IO, TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -39,7 +40,7 @@ _MAGIC, _GZIP, _PLAIN, _RLE, _OPTIONAL, _UTF8 = b"PAR1", 2, 0, 3, 1, 0
 _LEVEL = 1  # of gzip: covariances hardly shrink further
 MAX_COLUMNS = 4096
 MAX_BYTES = 8_000_000_000
-_BLOCK_ROWS = 50_000
+_BLOCK_ROWS, _SPOOL_BYTES = 2_000, 4_000_000
 _MOST_GROUPS = 1000  # of rows: what a file says of each column of each takes 1 kB to write and to read
 _PLAIN_BYTES, _MAX_RATIO = 200_000_000, 200
 _LARGEST = np.float64(1e100)  # No number of a run is larger: products of two or three stay finite.
@@ -63,14 +64,44 @@ def write_table(
 
     Raises OutputError, naming ``path``, as :func:`gpvo.files.replacing`.
     """
-    rows = len(next(iter(columns.values()), ()))
-    pages = [_page(values, KIND_OF.get(name, "float64")) for name, values in columns.items()]
-    sizes = np.array([[len(page), plain] for page, plain in pages], dtype=np.int64).reshape(-1, 2)
-    offset = len(_MAGIC) + np.cumsum(sizes[:, 0]) - sizes[:, 0]
-    group = RowGroup(path, rows, tuple(columns), np.column_stack([offset, sizes]))
-    with replacing(path, own) as temporary:
-        temporary.write_bytes(b"".join([_MAGIC, *(page for page, _ in pages), _footer([group], metadata)]))
+    return write_blocks(path, [columns], metadata, own)
+
+
+def write_blocks(
+    path: Path, blocks: Iterable[Mapping[str, Any]], metadata: Mapping[str, str] | None = None, own: Own | None = None
+) -> RowGroup:
+    """The same file of the rows of all blocks, one of which is in memory at a time, or a single column of all; a column
+    that a block lacks is null there."""
+    rows, end, place, parts = 0, len(_MAGIC), [], dict[str, list[tuple[int, int, int, int]]]()
+    # A page begins with which of its values there are, and is known only at the end.
+    with replacing(path, own) as temporary, _spool(path) as spool, temporary.open("wb") as file:
+        for block in blocks:
+            count = 0
+            for name, values in block.items():
+                present, data = _encoded(values, KIND_OF.get(name, "float64"))
+                count = len(present)
+                parts.setdefault(name, []).append((rows, count, spool.tell(), len(data)))
+                spool.write(data + present.tobytes())
+            rows += count
+        file.write(_MAGIC)
+        for name, pieces in parts.items():
+            there, known = np.zeros(rows, dtype=bool), bytearray()
+            for first, count, offset, size in pieces:
+                spool.seek(offset)
+                known += spool.read(size)
+                there[first : first + count] = np.frombuffer(spool.read(count), dtype=bool)
+            page, plain = _packed(there, known, KIND_OF.get(name, "float64"))
+            place.append((end, len(page), plain))
+            end += file.write(page)
+        group = RowGroup(path, rows, tuple(parts), np.array(place, dtype=np.int64).reshape(-1, 3))
+        file.write(_footer([group], metadata))
     return group
+
+
+def _spool(path: Path) -> IO[bytes]:
+    """Room for what does not fit into memory, on the disk of ``path``; nameless, so that a killed process leaves
+    none."""
+    return SpooledTemporaryFile(_SPOOL_BYTES, dir=str(path.parent))
 
 
 def join_tables(parts: Sequence[RowGroup], target: Path, metadata: Mapping[str, str] | None = None) -> None:
@@ -101,7 +132,13 @@ def _stored_page(stored: bytes, place: NDArray[np.int64] | None, rows: int, name
 
 def _page(values: Any, kind: str) -> tuple[bytes, int]:
     """A column's page with its header, and its size before compression."""
-    present, data = _encoded(values, kind)
+    return _packed(*_encoded(values, kind), kind)
+
+
+def _packed(present: NDArray[np.bool_], data: bytes | bytearray, kind: str) -> tuple[bytes, int]:
+    """The page of the values that there are, as :func:`_encoded` gives them."""
+    if kind == "bool":
+        data = np.packbits(np.frombuffer(data, dtype=bool), bitorder="little").tobytes()
     levels = _varint(((len(present) + 7) // 8) << 1 | 1) + np.packbits(present, bitorder="little").tobytes()
     plain = struct.pack("<I", len(levels)) + levels + data
     packer = zlib.compressobj(_LEVEL, zlib.DEFLATED, 31)
@@ -113,7 +150,7 @@ def _page(values: Any, kind: str) -> tuple[bytes, int]:
 
 
 def _encoded(values: Any, kind: str) -> tuple[NDArray[np.bool_], bytes]:
-    """Which values there are, and these in plain encoding."""
+    """Which values there are, and these in plain encoding, but for a byte of each boolean."""
     if kind.startswith("float"):
         numbers = np.asarray(values, dtype=f"<f{kind[5:].replace('64', '8').replace('32', '4')}")
         present = ~np.isnan(numbers)
@@ -124,7 +161,7 @@ def _encoded(values: Any, kind: str) -> tuple[NDArray[np.bool_], bytes]:
         texts = [str(v).encode() for v in there]
         return present, b"".join(struct.pack("<I", len(t)) + t for t in texts)
     if kind == "bool":
-        return present, np.packbits(np.asarray(there, dtype=bool), bitorder="little").tobytes()
+        return present, np.asarray(there, dtype=bool).tobytes()
     return present, np.asarray(there, dtype="<i8" if kind == "int64" else "<i4").tobytes()
 
 
@@ -221,7 +258,8 @@ def _opened(path: Path) -> Iterator[pq.ParquetFile]:
     import pyarrow.parquet as pq
 
     try:
-        with pq.ParquetFile(path, page_checksum_verification=True) as file:
+        # Buffered ahead, what is read block by block would be in memory as a whole all the same.
+        with pq.ParquetFile(path, pre_buffer=False, page_checksum_verification=True) as file:
             shape = file.metadata
             if shape.num_columns > MAX_COLUMNS:
                 raise SourceError(f"has {shape.num_columns} columns: too many for a run", where=path)

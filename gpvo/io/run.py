@@ -26,12 +26,23 @@ from gpvo.errors import SourceError
 from gpvo.files import digest_of_file, write_json, write_toml
 from gpvo.geometry.covariance import are_covariances, from_upper, upper
 from gpvo.io import run_folder, run_table
-from gpvo.io.parquet import RowGroup, join_tables, write_table
+from gpvo.io.parquet import RowGroup, join_tables, write_blocks, write_table
 from gpvo.io.run_folder import is_finished
 from gpvo.io.run_read import SCHEMA, Run, read_predictions, read_run, read_tracks, table_of
 from gpvo.io.snapshot import save_snapshot
 from gpvo.io.trajectory import tum_line
-from gpvo.types import Array, ImuLog, Mounting, Prediction, StereoCamera, StereoTracks, TruthLog, VoLog, VoRecord
+from gpvo.types import (
+    Array,
+    ImuLog,
+    Mounting,
+    Prediction,
+    StereoCamera,
+    StereoTracks,
+    TruthLog,
+    VoLog,
+    VoRecord,
+    batches,
+)
 
 __all__ = [
     "Run",
@@ -276,8 +287,9 @@ def copy_run(
 
 
 def write_predictions(path: str | Path, predictions: Iterable[Prediction]) -> None:
-    """Write predictions as a Parquet file of their own, as ``gpvo predict`` does."""
-    write_table(Path(path), run_table.prediction_columns(predictions), {"schema": str(SCHEMA)}, PREDICTIONS)
+    """Write predictions as they come to a Parquet file of their own, as ``gpvo predict`` does."""
+    blocks = map(run_table.prediction_columns, batches(predictions))
+    write_blocks(Path(path), blocks, {"schema": str(SCHEMA)}, PREDICTIONS)
 
 
 def as_stored(record: VoRecord) -> VoRecord:

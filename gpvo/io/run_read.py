@@ -17,7 +17,7 @@ from gpvo.errors import CalibrationError, SourceError, counted, printable
 from gpvo.files import read_json, read_toml
 from gpvo.geometry.covariance import LARGEST, are_semidefinite, variances
 from gpvo.io import run_table
-from gpvo.io.parquet import read_blocks, read_columns
+from gpvo.io.parquet import count_rows, read_blocks, read_columns
 from gpvo.types import (
     Array,
     ByStamp,
@@ -37,7 +37,7 @@ from gpvo.types import (
 
 T = TypeVar("T")
 
-SCHEMA = 1
+SCHEMA, _AT_ONCE = 1, 5_000
 _MAKE = "make one with 'gpvo run' of images, or 'gpvo import' of poses"
 _LARGEST = 1e12  # No mean or variance that a model states is larger [m, rad, m^2, rad^2].
 
@@ -163,7 +163,7 @@ _TWIN: dict[str, Callable[[Any], bool]] = {
 def read_predictions(path: str | Path) -> StoredPredictions:
     """Predictions of a Parquet file. Raises SourceError where it is damaged or holds something else."""
     p = Path(path)
-    predictions = StoredPredictions.join(_read_table(p, run_table.predictions_from))
+    predictions = StoredPredictions.join(_read_table(p, run_table.predictions_from), count_rows(p))
     if not predictions:
         return predictions
     of = predictions.columns
@@ -229,10 +229,10 @@ def _parts(path: Path, kind: str) -> list[Path]:
     return [joined] if joined.is_file() else sorted((path / "chunks").glob(f"{kind}_*.parquet"))
 
 
-def _read_table(path: Path, table_from: Callable[[dict[str, NDArray[Any]]], T]) -> list[T]:
+def _read_table(path: Path, table_from: Callable[[dict[str, NDArray[Any]]], T]) -> Iterator[T]:
     """A table in pieces, as it need not fit into memory as it is stored."""
     with _guarded(path):
-        return [table_from(columns) for columns in read_blocks(path)]
+        yield from map(table_from, read_blocks(path))
 
 
 def _read_log(path: Path, camera: StereoCamera | None, vehicle: Vehicle) -> VoLog:
@@ -240,8 +240,8 @@ def _read_log(path: Path, camera: StereoCamera | None, vehicle: Vehicle) -> VoLo
     if not parts:
         text = "holds no records: the run broke off before its first chunk"
         raise SourceError(text, where=path, cure="run the sequence again")
-    pieces = [piece for part in parts for piece in _read_table(part, run_table.records_from)]
-    log = VoLog(StoredRecords.join(pieces), camera, vehicle)
+    pieces = (piece for part in parts for piece in _read_table(part, run_table.records_from))
+    log = VoLog(StoredRecords.join(pieces, sum(map(count_rows, parts))), camera, vehicle)
     check_log(log, path / "vo_log.parquet")
     return log
 
@@ -256,27 +256,32 @@ def check_log(log: VoLog, path: Path) -> None:
     t_prev = log.column("t_prev_ns")
     if (~np.isin(t_prev, t) | (t_prev > t))[1:].any():
         raise SourceError("a record starts from a frame that is not in it", where=path, cure="run the sequence again")
-    _check_poses(log.T_prev_cur, path)
-    for method in log.methods:
-        C = log.covariance(method)
-        _check_covariances(C[log.usable & ~np.isnan(C).all(axis=(1, 2))], f"{method} covariance", path)
+    checked = dict.fromkeys(log.methods, 0)
+    for first in range(0, len(t), _AT_ONCE):
+        part = log.rows(slice(first, first + _AT_ONCE))
+        _check_poses(part.T_prev_cur, path, first)
+        for method in checked:
+            C = part.covariance(method)
+            C = C[part.usable & ~np.isnan(C).all(axis=(1, 2))]
+            _check_covariances(C, f"{method} covariance", path, first=checked[method])
+            checked[method] += len(C)
 
 
-def _check_covariances(C: Array, what: str, path: Path, *, semi: bool = False) -> None:
+def _check_covariances(C: Array, what: str, path: Path, *, semi: bool = False, first: int = 0) -> None:
     good = are_semidefinite(C)  # up to rounding: a sum of stored parts is rounded otherwise than its writer's
     good &= semi | (variances(C) > 1 / LARGEST).all(axis=1)
     if not good.all():
         word = "positive semidefinite" if semi else "positive definite"
-        raise SourceError(f"its {what} number {int(np.flatnonzero(~good)[0]) + 1} is not {word}", where=path)
+        raise SourceError(f"its {what} number {first + int(np.flatnonzero(~good)[0]) + 1} is not {word}", where=path)
 
 
-def _check_poses(T: Array, path: Path) -> None:
+def _check_poses(T: Array, path: Path, first: int = 0) -> None:
     R = T[:, :3, :3]
     with np.errstate(invalid="ignore", over="ignore"):
         good = np.isfinite(T).all(axis=(1, 2))
         good &= np.abs(R @ np.swapaxes(R, 1, 2) - np.eye(3)).max(axis=(1, 2)) < 1e-6
     if not good.all():
-        raise SourceError(f"row {int(np.flatnonzero(~good)[0])} holds no rigid motion", where=path)
+        raise SourceError(f"row {first + int(np.flatnonzero(~good)[0])} holds no rigid motion", where=path)
 
 
 def _read_rig(path: Path) -> tuple[StereoCamera | None, Mounting]:

@@ -164,7 +164,8 @@ def prediction_columns(predictions: Iterable[Prediction]) -> Columns:
 def predictions_from(columns: Mapping[str, NDArray[Any]]) -> StoredPredictions:
     """Predictions of :func:`prediction_columns`.
 
-    A bias without a time constant counts as white. The root of what persists is that of its covariance, to rounding.
+    A bias without a time constant counts as white, an error without ``nu``, as a lost one's, as Gaussian. The root of
+    what persists is that of its covariance, to rounding.
     Raises KeyError or ValueError where a column is absent or a status unknown.
     """
     n = len(columns["t_ns"])
@@ -195,7 +196,8 @@ def predictions_from(columns: Mapping[str, NDArray[Any]]) -> StoredPredictions:
             "t_ns": np.array([int(t) for t in columns["t_ns"].tolist()], dtype=np.int64),
             "epistemic": epistemic,
             **{name: np.asarray(columns[name], dtype=np.float64) for name in ("dt_s", "confidence", "in_domain")},
-            "nu": np.asarray(columns.get("nu", np.full(n, np.inf)), dtype=np.float64),
+            # Null in the chunks of a run that hold nothing but lost motions.
+            "nu": np.where(np.isnan(nu := _float(columns, "nu", n)), np.inf, nu),
         }
     )
 

@@ -11,17 +11,18 @@ inputs) and fusioncore_core/include/fusioncore/sensors/vslam.hpp (floors, and wh
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from gpvo.errors import GpvoError
 from gpvo.geometry.covariance import variances
 from gpvo.online.features import AXES
 from gpvo.publish.odometry import Odometry
-from gpvo.types import Array
+from gpvo.types import Array, batches
 
 CONSUMERS = ("px4", "ardupilot", "robot_localization", "fusioncore")
 
@@ -37,6 +38,7 @@ FUSIONCORE_FALLBACK = (0.1, 0.02)
 """Standard deviations [m, rad] that FusionCore takes for a position or an attitude of which a variance is zero."""
 FUSIONCORE_LEAST = (0.01, 0.001)
 """Smallest standard deviations [m, rad] that it takes."""
+_PLANAR = [0, 1, 5]  # what it reads of a twist
 
 
 def fusioncore_sigmas(covariance: Array) -> Array:
@@ -92,20 +94,43 @@ class Verdict:
         return {**vars(self), "axes": axes, "advice": self.advice or None}
 
 
-def check(odometry: Sequence[Odometry], consumer: str) -> list[Verdict]:
-    """What ``consumer`` will do with these messages. Raises ``GpvoError`` for an unknown one or no tracked frame."""
-    good = [o for o in odometry if o.twist_covariance is not None]
-    if not good:
-        raise GpvoError("no frame of this run has a motion to publish")
-    checks = dict(zip(CONSUMERS, (_check_px4, _check_ardupilot, _check_robot_localization, _check_fusioncore)))
-    if consumer not in checks:
-        raise GpvoError(f"unknown consumer '{consumer}'", cure=f"choose {', '.join(CONSUMERS)}")
-    pose = np.array([o.pose_covariance for o in good])
-    return checks[consumer](pose, np.array([o.twist_covariance for o in good], dtype=np.float64))
+class Check:
+    """What ``consumer`` will do with messages that pass by. Raises GpvoError for an unknown one."""
+
+    def __init__(self, consumer: str) -> None:
+        if consumer not in CONSUMERS:
+            raise GpvoError(f"unknown consumer '{consumer}'", cure=f"choose {', '.join(CONSUMERS)}")
+        self._consumer, self._seen = consumer, list[tuple[Array, ...]]()
+
+    def passing(self, odometry: Iterable[Odometry]) -> Iterator[Odometry]:
+        """The same messages; of each, what the verdicts rest on is kept."""
+        for some in batches(odometry):
+            if good := [o for o in some if o.twist_covariance is not None]:
+                pose = np.array([o.pose_covariance for o in good])
+                twist = np.array([o.twist_covariance for o in good], dtype=np.float64)
+                hidden = (_hidden(pose, twist),) if self._consumer == "fusioncore" else ()
+                self._seen.append((variances(pose).copy(), variances(twist).copy(), *hidden))
+            yield from some
+
+    def verdicts(self) -> list[Verdict]:
+        """On all that have passed. Raises GpvoError where none of them was tracked."""
+        if not self._seen:
+            raise GpvoError("no frame of this run has a motion to publish")
+        told = [np.concatenate(parts) for parts in zip(*self._seen, strict=True)]
+        return _CHECKS[self._consumer](*told)
+
+
+def check(odometry: Iterable[Odometry], consumer: str) -> list[Verdict]:
+    """What ``consumer`` will do with these messages. Raises GpvoError as :class:`Check`."""
+    found = Check(consumer)
+    for _ in found.passing(odometry):
+        pass
+    return found.verdicts()
 
 
 def _check_robot_localization(pose: Array, twist: Array) -> list[Verdict]:
-    pose, twist = np.sqrt(variances(pose)), np.sqrt(variances(twist))
+    """By variances (n, 6), as the others."""
+    pose, twist = np.sqrt(pose), np.sqrt(twist)
     parts = (
         ("velocity", twist[:, :3], "m/s"),
         ("turn rate", twist[:, 3:], "rad/s"),
@@ -116,7 +141,7 @@ def _check_robot_localization(pose: Array, twist: Array) -> list[Verdict]:
 
 
 def _check_px4(pose: Array, twist: Array) -> list[Verdict]:
-    pose, twist = np.sqrt(variances(pose)), np.sqrt(variances(twist))
+    pose, twist = np.sqrt(pose), np.sqrt(twist)
     out = []
     for quantity, name, sigma, unit in (
         ("velocity", "EKF2_EVV_NOISE", twist[:, :3], "m/s"),
@@ -129,20 +154,26 @@ def _check_px4(pose: Array, twist: Array) -> list[Verdict]:
     return out
 
 
-def _check_fusioncore(pose: Array, twist: Array) -> list[Verdict]:
-    """What is lost are correlations and a pose's small sigmas: ``hidden_percent`` of the frames have a combination of
-    axes that is taken for more than twice as uncertain as it is."""
-    out, read = [], [0, 1, 5]
-    planar = twist[:, read][:, :, read]
+def _hidden(pose: Array, twist: Array) -> NDArray[np.bool_]:
+    """(n, 2) whether FusionCore takes a combination of axes, of twists and of poses (n, 6, 6), for more than twice as
+    uncertain as it is: correlations are lost, and a pose's small sigmas."""
+    planar = twist[:, _PLANAR][:, :, _PLANAR]
     used = np.array([fusioncore_sigmas(C) for C in pose])
+    pairs = (planar, np.sqrt(variances(planar))), (pose, used)
+    least = [np.linalg.eigvalsh(C / (sigma[:, :, None] * sigma[:, None, :]))[:, 0] for C, sigma in pairs]
+    return np.stack(least, axis=1) < 0.25
+
+
+def _check_fusioncore(pose: Array, twist: Array, hidden: NDArray[np.bool_]) -> list[Verdict]:
+    """``hidden_percent``: share of the frames of which something is :func:`_hidden`."""
+    out = []
     of_twist = ("vx", "m/s"), ("vy", "m/s"), ("yaw rate", "rad/s")
     of_pose = tuple(zip(AXES, ("m",) * 3 + ("rad",) * 3, strict=True))
-    for quantity, C, sigma, axes, reads in (
-        ("twist", planar, np.sqrt(variances(planar)), of_twist, "vx, vy and the yaw rate as an encoder's"),
-        ("pose", pose, used, of_pose, "the pose as VSLAM's, to no less than 0.01 m and 0.001 rad"),
+    for quantity, variance, hides, axes, reads in (
+        ("twist", twist[:, _PLANAR], hidden[:, 0], of_twist, "vx, vy and the yaw rate as an encoder's"),
+        ("pose", pose, hidden[:, 1], of_pose, "the pose as VSLAM's, to no less than 0.01 m and 0.001 rad"),
     ):
-        hidden = np.linalg.eigvalsh(C / (sigma[:, :, None] * sigma[:, None, :]))[:, 0] < 0.25
-        percent, stated = 100.0 * float(hidden.mean()), np.sqrt(variances(C))
+        percent, stated = 100.0 * float(hides.mean()), np.sqrt(variance)
         told = (Axis(name, _percentiles(s), unit, percent) for (name, unit), s in zip(axes, stated.T, strict=True))
         advice = f"It reads {reads}, and its chi-square gate is only as good as these sigmas; send no zeros"
         cause = "use of the diagonal alone"
@@ -151,7 +182,6 @@ def _check_fusioncore(pose: Array, twist: Array) -> list[Verdict]:
 
 
 def _check_ardupilot(pose: Array, twist: Array) -> list[Verdict]:
-    pose, twist = variances(pose), variances(twist)
     out = []
     for quantity, name, old, new, unit in (
         ("position", "VISO_POS_M_NSE", np.cbrt((pose[:, :3] ** 2).sum(1)), np.sqrt(pose[:, :3].sum(1)), "m"),
@@ -205,3 +235,11 @@ def _verdict(
             still = 100 * float((sigma < minimum).any(axis=1).mean())
             advice += f", the smallest it accepts, which hides {'an axis in ' * (len(axes) > 1)}{still:.0f} %"
     return Verdict(quantity, name, value, hidden, axes, advice)
+
+
+_CHECKS: dict[str, Callable[..., list[Verdict]]] = {
+    "px4": _check_px4,
+    "ardupilot": _check_ardupilot,
+    "robot_localization": _check_robot_localization,
+    "fusioncore": _check_fusioncore,
+}

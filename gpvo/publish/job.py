@@ -3,14 +3,14 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Mapping, Sequence
+from collections import deque
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from gpvo.dataset.build import predictions_of
 from gpvo.dataset.check import warn_of_misfits
 from gpvo.errors import GpvoError, counted
 from gpvo.files import refuse_foreign, write_text
@@ -18,8 +18,8 @@ from gpvo.io.run import Run, read_run
 from gpvo.io.stamps import END_OF_ROS_NS
 from gpvo.online.predictor import Predictor
 from gpvo.publish import PublishSettings, consumers, mavlink, ros
-from gpvo.publish.odometry import Odometry, OdometryBuilder, messages
-from gpvo.types import Prediction
+from gpvo.publish.odometry import Odometry, OdometryBuilder
+from gpvo.types import Prediction, VoRecord
 
 TARGETS = ("bag", "mcap", "mavlink")
 _PARAMETERS = (b"^# robot_localization fed by gpvo", "file of parameters")
@@ -84,28 +84,72 @@ def publish_run(path: Path, settings: PublishSettings) -> Published:
     model = settings.model
     predictor = None if model is None else Predictor.load(model).require_motions(model)
     warn_of_misfits(model, predictor, run)
-    predictions = predictions_of(run, predictor)
-    odometry = odometry_of(run, predictions, settings)
+    stated, source = _stated(run, predictor, settings)
     consumer = settings.consumer or ("px4" if settings.to == "mavlink" else "robot_localization")
-    verdicts = consumers.check(odometry, consumer) if settings.check else []
-    out, count = (None, 0) if settings.to is None else _write(run, odometry, settings)
-    source = "the model" if settings.model or predictions else settings.method
-    lost = sum(not o.tracked for o in odometry)
-    outside = sum(mavlink.quality(o) < 0 for o in odometry) - lost
-    asked = consumer if settings.check else None
-    placed, body, of_poses = run.mounting.T_body_cam is not None, run.mounting.body, run.log.camera is None
-    return Published(run.name, settings.to, out, count, lost, outside, source, asked, placed, body, of_poses, verdicts)
+    passed = _Passed(run, settings.to, consumers.Check(consumer) if settings.check else None)
+    out, count = _write(run, passed.of(odometry_of(run, stated, settings)), settings)
+    return Published(
+        run=run.name,
+        to=settings.to,
+        out=out,
+        messages=count,
+        lost=passed.lost,
+        outside=passed.refused - passed.lost,
+        source=source,
+        consumer=consumer if settings.check else None,
+        is_placed=run.mounting.T_body_cam is not None,
+        body=run.mounting.body,
+        of_poses=run.log.camera is None,
+        verdicts=passed.verdicts,
+    )
 
 
-def odometry_of(run: Run, predictions: Mapping[int, Prediction], settings: PublishSettings) -> list[Odometry]:
-    """All messages of a run, with ``predictions`` by ``t_ns``; its ``odom`` starts at the body's first pose."""
-    usable = run.log.usable.any()
-    if usable and not predictions and not any(r.covariances for r in run.log if r.usable):
+def _stated(
+    run: Run, predictor: Predictor | None, settings: PublishSettings
+) -> tuple[Callable[[VoRecord], Prediction | None], str]:
+    """What is predicted of each record in turn, and whose the covariances are."""
+    if predictor is not None:
+        predictor.reset(run.log.camera, vehicle=run.log.vehicle)
+        return predictor.step, "the model"
+    if stored := run.predictions_of_motions:
+        return (lambda r: stored.get(r.t_ns)), "the model"
+    if run.log.usable.any() and not any(r.covariances for r in run.log if r.usable):
         raise GpvoError("holds neither predictions nor covariances", where=run.path, cure="give --model")
+    return (lambda _: None), settings.method
+
+
+class _Passed:
+    """What is told of the messages of a run that have passed by. At their end, before anything is put in place, it
+    raises GpvoError where a ``check`` or a bag has nothing to hold on to."""
+
+    def __init__(self, run: Run, to: str | None, check: consumers.Check | None) -> None:
+        self._run, self._to, self._check = run, to, check
+        self.lost = self.refused = 0
+        self.verdicts: list[consumers.Verdict] = []
+
+    def of(self, odometry: Iterable[Odometry]) -> Iterator[Odometry]:
+        """The same messages."""
+        moves = False
+        for o in odometry if self._check is None else self._check.passing(odometry):
+            self.lost += not o.tracked
+            self.refused += mavlink.quality(o) < 0
+            moves |= o.twist_body is not None
+            yield o
+        if self._check is not None:
+            self.verdicts = self._check.verdicts()
+        if self._to in ("bag", "mcap") and not moves:
+            raise GpvoError("no frame has a motion: nothing to put into a bag", where=self._run.path)
+
+
+def odometry_of(
+    run: Run, stated: Callable[[VoRecord], Prediction | None], settings: PublishSettings
+) -> Iterator[Odometry]:
+    """All messages of a run, with the prediction ``stated`` of each record; its ``odom`` starts at the body's first
+    pose."""
     builder = OdometryBuilder(T_body_cam=run.mounting.T_body_cam, method=settings.method)
-    body = run.mounting.body
     try:
-        return [replace(o, child_frame_id=body) for o in messages(run.log, predictions, builder)]
+        for record in run.log:
+            yield replace(builder.step(record, stated(record)), child_frame_id=run.mounting.body)
     except GpvoError as error:
         raise GpvoError(error.what, where=run.path, cure=error.cure) from None
 
@@ -140,12 +184,11 @@ def _require(settings: PublishSettings) -> None:
         mavlink.dialect()
 
 
-def _check_stamps(run: Run, odometry: Sequence[Odometry], settings: PublishSettings) -> None:
+def _check_stamps(run: Run, settings: PublishSettings) -> None:
     """Raise GpvoError where a stamp does not fit the messages: all count from 1970, those of ROS in 31 bits of
     seconds."""
-    last_ns = max(o.t_ns for o in odometry)
-    early = min(o.t_ns for o in odometry) < 0
-    if early or (settings.to != "mavlink" and last_ns >= END_OF_ROS_NS):
+    early = run.log.t_ns[0] < 0
+    if early or (settings.to != "mavlink" and run.log.t_ns[-1] >= END_OF_ROS_NS):
         when = "before 1970" if early else "after January 2038, where those of ROS end"
         raise GpvoError(f"has stamps {when}", where=run.path, cure="subtract an offset from the stamps of its source")
 
@@ -164,21 +207,24 @@ def _refuse_other(settings: PublishSettings) -> None:
         refuse_foreign(_parameters(settings.out), *_PARAMETERS)
 
 
-def _write(run: Run, odometry: Sequence[Odometry], settings: PublishSettings) -> tuple[str, int]:
-    _check_stamps(run, odometry, settings)
+def _write(run: Run, odometry: Iterable[Odometry], settings: PublishSettings) -> tuple[str | None, int]:
+    """Write or send the messages as they come; where, and how many. All of them pass, also if none is written."""
+    if settings.to is None:
+        deque(odometry, maxlen=0)
+        return None, 0
+    _check_stamps(run, settings)
     if settings.link is not None:
-        return settings.link, _replay(odometry, mavlink.Link(settings.link, settings.system))
+        # What cannot be published is refused before anything is sent.
+        return settings.link, _replay(list(odometry), mavlink.Link(settings.link, settings.system))
     out = settings.out
     assert out is not None
     if settings.to == "mavlink":
         return str(out), mavlink.write_tlog(out, odometry, system=settings.system)
-    if all(o.twist_body is None for o in odometry):
-        raise GpvoError("no frame has a motion: nothing to put into a bag", where=run.path)
     kind = ros.kind_of(out, settings.to)
     count = ros.write_bag(out, odometry, settings.topic, kind)
-    rate_hz = 1.0 / float(np.median(np.diff([o.t_ns for o in odometry])) * 1e-9)
+    rate_hz = 1.0 / float(np.median(np.diff(run.log.t_ns)) * 1e-9)
     text = ros.robot_localization_yaml(
-        settings.topic, rate_hz=max(30.0, rate_hz), ros1=kind == "ros1", base=odometry[0].child_frame_id
+        settings.topic, rate_hz=max(30.0, rate_hz), ros1=kind == "ros1", base=run.mounting.body
     )
     write_text(_parameters(out), text, own=_PARAMETERS)
     return str(out), count

@@ -16,6 +16,7 @@ from gpvo.types.records import (
     StoredRecords,
     VoLog,
     VoRecord,
+    batches,
     frequent_reasons,
 )
 from gpvo.types.sensors import (
@@ -67,6 +68,7 @@ __all__ = [
     "Vehicle",
     "VoLog",
     "VoRecord",
+    "batches",
     "field_names",
     "frequent_reasons",
     "out_of_limits",

@@ -131,16 +131,22 @@ class Columns(Sequence[_Item], ABC):
     columns: Mapping[str, NDArray[Any]]
 
     @classmethod
-    def join(cls: type[_Rows], parts: Sequence[_Rows]) -> _Rows:
-        """One after the other; of mappings by method or stage, with those of all, NaN where a part has none."""
-        lengths = [len(part) for part in parts]
-
-        def joined(maps: Sequence[Mapping[str, NDArray[Any]]]) -> dict[str, NDArray[Any]]:
-            shape = {name: column.shape[1:] for m in maps for name, column in m.items()}
-            absent = {name: [np.broadcast_to(np.nan, (n, *of)) for n in lengths] for name, of in shape.items()}
-            return {name: np.concatenate([m.get(name, a) for m, a in zip(maps, absent[name])]) for name in shape}
-
-        return cls(*(joined([getattr(part, name) for part in parts]) for name in field_names(cls)))
+    def join(cls: type[_Rows], parts: Iterable[_Rows], count: int | None = None) -> _Rows:
+        """One after the other; of mappings by method or stage, with those of all, NaN where a part has none. Where
+        their ``count`` of rows is known, one part is in memory at a time."""
+        if count is None:
+            parts = list(parts)
+            count = sum(map(len, parts))
+        joined, end = {name: dict[str, NDArray[Any]]() for name in field_names(cls)}, 0
+        for part in parts:
+            start, end = end, end + len(part)
+            for field_name, columns in joined.items():
+                for name, column in getattr(part, field_name).items():
+                    if name not in columns:
+                        fill = np.nan if column.dtype.kind == "f" else 0
+                        columns[name] = np.full((count, *column.shape[1:]), fill, dtype=column.dtype)
+                    columns[name][start:end] = column
+        return cls(**joined)
 
     @abstractmethod
     def made(self, k: int) -> _Item:
@@ -330,10 +336,11 @@ class VoLog:
         columns = {**self.records.columns, "status": said[:, 0], "reason": said[:, 1]}
         return replace(self, records=replace(self.records, columns=columns))
 
-    def rows(self, keep: NDArray[np.bool_]) -> VoLog:
-        """A part (N,) of the records."""
+    def rows(self, keep: NDArray[np.bool_] | slice) -> VoLog:
+        """A part of the records: those marked (N,), or a stretch."""
         if not isinstance(self.records, StoredRecords):
-            return replace(self, records=[r for r, k in zip(self.records, keep, strict=True) if k])
+            kept = np.arange(len(self))[keep].tolist()
+            return replace(self, records=[self.records[k] for k in kept])
         maps = (getattr(self.records, f.name) for f in fields(StoredRecords))
         return replace(self, records=StoredRecords(*({name: c[keep] for name, c in m.items()} for m in maps)))
 

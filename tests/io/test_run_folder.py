@@ -159,6 +159,29 @@ def test_predictions_take_two_kilobytes_each(tmp_path):
     assert [p.t_ns for p in found[5:9]] == [r.t_ns for r in records[5:9]]
 
 
+def test_predictions_are_written_as_they_come(tmp_path):
+    """All at once, 16,000 of them took 60 MB."""
+    rng = np.random.default_rng(0)
+    few = [make_prediction(r, rng) for r in make_records(40)]
+    tracemalloc.start()
+    write_predictions(tmp_path / "p.parquet", (p for _ in range(400) for p in few))
+    peak = tracemalloc.get_traced_memory()[1]
+    tracemalloc.stop()
+    assert peak < 16e6
+    assert [p.t_ns for p in read_predictions(tmp_path / "p.parquet")[15_990:]] == [p.t_ns for p in few[30:]]
+
+
+def test_a_run_that_was_lost_for_a_whole_chunk_is_read_with_its_predictions(tmp_path):
+    """A lost motion has no degrees of freedom, and a chunk of nothing else no column of them."""
+    rng, records = np.random.default_rng(1), make_records(12)
+    predictions = [make_prediction(r, rng) for r in records]
+    predictions = [replace(p, nu=np.inf if 4 <= k < 9 else 5.0) for k, p in enumerate(predictions)]
+    with RunWriter(tmp_path / "run", camera=CAMERA, chunk=4) as writer:
+        for record, prediction in zip(records, predictions, strict=True):
+            writer.append(record, prediction)
+    assert [p.nu for p in read_run(tmp_path / "run").predictions] == [p.nu for p in predictions]
+
+
 def test_digests_are_of_files_that_do_not_fit_into_memory(tmp_path):
     """The tracks of a run of hours."""
     (tmp_path / "tracks.parquet").write_bytes(bytes(20_000_000))

@@ -11,7 +11,7 @@ import numpy as np
 import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
-from gpvo.io.parquet import join_tables, numbers_of, read_columns, write_table
+from gpvo.io.parquet import join_tables, numbers_of, read_columns, write_blocks, write_table
 from hypothesis import given, settings
 
 ROOT = Path(__file__).parents[2]
@@ -58,6 +58,9 @@ def test_joined_parts_are_one_table(parts, late, tmp_path_factory):
     for name, values in read.items():
         expected = [v for part in parts for v in part.get(name, [None] * len(part["t_ns"]))]
         assert values == expected
+    write_blocks(folder / "blocks.parquet", iter(parts), {"schema": "1"})
+    write_table(folder / "once.parquet", read, {"schema": "1"})
+    assert (folder / "blocks.parquet").read_bytes() == (folder / "once.parquet").read_bytes()
 
 
 def test_the_footer_of_a_long_run_stays_small(tmp_path):
