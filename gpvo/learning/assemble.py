@@ -60,8 +60,7 @@ def assemble(rows: Rows, columns: tuple[str, ...], learned: VarianceModel) -> tu
         variance * scale.factor,
         rows.geometry(base.method),
         group_folds(rows.group, _MOST_FOLDS),
-        windows_of(at_most(rows.chains(np.arange(len(error))), MOST_ROWS)),
-        rows.motions(),
+        windows_of(at_most(rows.chains(np.arange(len(error))), MOST_ROWS), rows.motions()),
     )
     X = rows.select(columns)
     z = error / np.sqrt(of.variance)
@@ -94,15 +93,14 @@ def assemble(rows: Rows, columns: tuple[str, ...], learned: VarianceModel) -> tu
 @dataclass(frozen=True)
 class _Residuals:
     """All rows, the ``variance`` (n, 6) of their errors out of fold, calibrated for each axis, the geometric covariance
-    (n, 6, 6), the ``fold`` (n,) that is left out with each row, the ``windows`` whose poses are looked at, the motions
-    ``T_prev_cur`` (n, 4, 4), and ``patterns`` if calibration has a part of its own."""
+    (n, 6, 6), the ``fold`` (n,) that is left out with each row, the ``windows`` whose poses are looked at, and
+    ``patterns`` if calibration has a part of its own."""
 
     rows: Rows
     variance: Array
     geometry: Array | None
     fold: NDArray[np.int64]
     windows: Sequence[Windows]
-    T_prev_cur: Array
     patterns: Patterns | None = None
 
     def of_calibration(self) -> tuple[Array | None, Array, Array]:
@@ -197,7 +195,7 @@ def _jointly(of: _Residuals, divided: _Divided) -> tuple[Array, float, list[Pose
     whole = jitter + white + root @ np.swapaxes(root, -1, -2)
     joint = fit_joint_factor(of.rows.error, whole, of.rows.group)
     phi = np.exp(-of.rows.step_s / divided.whole.persistent_tau_s)
-    motions = of.T_prev_cur, of.rows.error, jitter * joint, white * joint, root * np.sqrt(joint)
+    motions = of.rows.error, jitter * joint, white * joint, root * np.sqrt(joint)
     return whole * joint, joint, [Poses.over(w, *motions, phi) for w in of.windows]
 
 

@@ -95,15 +95,16 @@ def _mode(prior: ProjectedGP, Z: Array, ratio: Array, weight: Array, group: NDAr
     information = np.maximum(information, 0.0)
     Z, centred = Z @ V, centred @ V
     precision = information[:, None] + 1.0 / _PRIOR_VAR
-    A, g = np.zeros((Z.shape[1], 6)), np.zeros_like(ratio)
+    along, g = np.zeros_like(ratio), np.zeros_like(ratio)
     # A Student-t's scale is smaller than its second moment, of which the ratio is.
     scale_ratio = ratio * NU / (NU - 2.0)
     for _ in range(_STEPS):
         score = log_scale_score(scale_ratio * np.exp(-np.clip(g, -_FAR_ASTRAY, _FAR_ASTRAY)), NU)
         response = g + score / fisher
-        level = of_group(response - Z @ A)
+        level = of_group(response - along)
         A = (centred.T @ (response * (weight * fisher)[:, None]) @ _ROTATION.T / precision) @ _ROTATION
-        moved, g = g, Z @ A + level
+        along = Z @ A
+        moved, g = g, along + level
         if np.abs(g - moved).max() < _ENOUGH:
             break
     explained = _PRIOR_VAR - 1.0 / precision

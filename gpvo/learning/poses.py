@@ -31,23 +31,26 @@ _MOST_NEES = 16.0
 class Windows:
     """Separate windows of m motions each, of unbroken chains: the ``rows`` (w, m) of their motions. ``belongs`` (w, S):
     to which sequence, its columns summing to one: a sequence counts as one, however many windows it has, as its errors
-    go together."""
+    go together. ``to_end`` (w, m, 6, 6): adjoints that carry the error of each motion to the last."""
 
     rows: NDArray[np.int64]
     belongs: Array
+    to_end: Array
 
     @classmethod
-    def of(cls, chains: Chains, m: int) -> Windows:
-        """Of ``chains`` of rows."""
+    def of(cls, chains: Chains, m: int, T_prev_cur: Array) -> Windows:
+        """Of ``chains`` of rows, with the motions (n, 4, 4) of all rows."""
         rows = np.concatenate([cut(chain, m) for some in chains for chain in some])
         counts = [sum(len(chain) // m for chain in some) for some in chains]
-        return cls(rows, np.repeat(np.eye(len(chains)) / np.maximum(counts, 1.0), counts, axis=0))
+        belongs = np.repeat(np.eye(len(chains)) / np.maximum(counts, 1.0), counts, axis=0)
+        return cls(rows, belongs, adjoints_to_end(T_prev_cur[rows]))
 
 
-def windows_of(chains: Chains) -> list[Windows]:
-    """Single motions, and windows of ten and more of them as far as there are enough; ``chains`` of rows."""
+def windows_of(chains: Chains, T_prev_cur: Array) -> list[Windows]:
+    """Single motions, and windows of ten and more of them as far as there are enough; ``chains`` of rows, and the
+    motions (n, 4, 4) of all."""
     counts = {m: sum(len(chain) // m for some in chains for chain in some) for m in SPANS if m == 1 or m >= _LONG}
-    return [Windows.of(chains, m) for m, count in counts.items() if count >= _LEAST_WINDOWS]
+    return [Windows.of(chains, m, T_prev_cur) for m, count in counts.items() if count >= _LEAST_WINDOWS]
 
 
 def added_factor(poses: Sequence[Poses], share: Array) -> float:
@@ -96,17 +99,14 @@ class Poses:
     at_ends: Array
 
     @classmethod
-    def over(
-        cls, windows: Windows, T_prev_cur: Array, error: Array, jitter: Array, white: Array, root: Array, phi: Array
-    ) -> Poses:
+    def over(cls, windows: Windows, error: Array, jitter: Array, white: Array, root: Array, phi: Array) -> Poses:
         """As :class:`gpvo.accumulation.PoseError` adds up, for all windows at once and with one time step.
 
-        Of all motions (n, 4, 4) the errors (n, 6), the covariances ``jitter`` and ``white`` (n, 6, 6), and the ``root``
+        Of all motions the errors (n, 6), the covariances ``jitter`` and ``white`` (n, 6, 6), and the ``root``
         (n, 6, 12) of the bias and of what a wrong calibration adds; ``phi`` (12,): correlation of the latter two from
         one motion to the next.
         """
-        rows, ends = windows.rows, [0, -1]
-        to_end = adjoints_to_end(T_prev_cur[rows])
+        rows, ends, to_end = windows.rows, [0, -1], windows.to_end
         at_both = _carried(to_end[:, ends], jitter[rows[:, ends]])
         whites, roots = _carried(to_end, white[rows]), to_end @ root[rows]
         bias, calibration = roots[..., :6], roots[..., 6:]

@@ -32,8 +32,8 @@ def test_what_is_stated_of_a_pose_is_what_adds_up_along_a_path():
     T, parts = se3.exp(0.3 * rng.standard_normal((n, 6))), _covariances(rng, n)
     root = rng.standard_normal((n, 6, 1)) * rng.standard_normal((6, 6))
     whole = np.concatenate([scaled_root(parts[:, 2]), root], axis=-1)
-    windows = Windows.of([[np.arange(n)]], n)
-    stated = Poses.over(windows, T, np.zeros((n, 6)), parts[:, 0], parts[:, 1], whole, BOTH)
+    windows = Windows.of([[np.arange(n)]], n, T)
+    stated = Poses.over(windows, np.zeros((n, 6)), parts[:, 0], parts[:, 1], whole, BOTH)
     pose = PoseError()
     tau_s, lasting_s = np.split(-1.0 / np.log(BOTH), 2)
     for T_prev_cur, (jit, white, bias), L in zip(T, parts, root):
@@ -75,7 +75,8 @@ def _factor(flights: Sequence[Motions]) -> float:
     every = [np.concatenate([getattr(f, name.name) for f in flights]) for name in fields(Motions)]
     ends = np.cumsum([len(f.error) for f in flights])
     chains = [[rows] for rows in np.split(np.arange(ends[-1]), ends[:-1])]
-    return added_factor([Poses.over(w, *every, BOTH) for w in windows_of(chains)], SHARE)
+    windows = windows_of(chains, every[0])
+    return added_factor([Poses.over(w, *every[1:], BOTH) for w in windows], SHARE)
 
 
 def test_right_parts_stay_as_they_are():
