@@ -6,14 +6,13 @@ import math
 import warnings
 from dataclasses import dataclass, replace
 from pathlib import Path
-from tempfile import TemporaryDirectory
 from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
 from gpvo.cli.common import refuse_twice
 from gpvo.cli.output import Json, cell, numbers, print_json, progress, say, show, time_offset
-from gpvo.cli.twin import TWINS, Seed, TwinOptions, make_all, say_simulated
+from gpvo.cli.twin import TWINS, Seed, TwinOptions, say_simulated, twins_of
 from gpvo.errors import GpvoError, counted
 from gpvo.files import in_metres, refuse_folder, refuse_foreign
 from gpvo.io.run import Run, read_run
@@ -202,14 +201,14 @@ def _with_twins(
     from gpvo.dataset.check import warn_of_misfits
     from gpvo.evaluation.by_twins import by_twins
 
-    documents, found = [], []
-    for run in runs:
-        with TemporaryDirectory(prefix="gpvo-twins-") as folder:
-            twins = [read_run(p) for p in make_all([run.path], Path(folder), settings)]
-        judged = run if run.truth is not None else twins[0]
-        about, own = by_twins(run, twins, predictor, options, warn_of_misfits(model, predictor, judged))
-        documents.append(about)
-        found += own
+    documents, found, n = [], [], settings.replicates
+    with twins_of([run.path for run in runs], settings) as made:
+        for k, run in enumerate(runs):
+            twins = [read_run(p) for p in made[k * n : (k + 1) * n]]
+            judged = run if run.truth is not None else twins[0]
+            about, own = by_twins(run, twins, predictor, options, warn_of_misfits(model, predictor, judged))
+            documents.append(about)
+            found += own
     return documents, found
 
 

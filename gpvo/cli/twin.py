@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
+import os
+import shutil
 from collections.abc import Iterator, Mapping, Sequence
-from contextlib import contextmanager, nullcontext
-from dataclasses import dataclass, fields
+from contextlib import ExitStack, contextmanager, nullcontext
+from dataclasses import asdict, dataclass, fields
 from pathlib import Path
-from tempfile import TemporaryDirectory
+from stat import S_ISDIR
+from tempfile import TemporaryDirectory, gettempdir
 from typing import TYPE_CHECKING, Annotated, Any
 
 import numpy as np
@@ -15,7 +18,8 @@ import typer
 from gpvo.cli.common import refuse_idle
 from gpvo.cli.output import Json, answer, note, print_json, progress, say, show, status
 from gpvo.dataset.errors import require_attitude
-from gpvo.errors import GpvoError, counted
+from gpvo.errors import GpvoError, OutputError, counted
+from gpvo.files import FolderLock
 from gpvo.io.run import Run, read_run
 from gpvo.online.features import AXES
 
@@ -142,6 +146,31 @@ def make_all(runs: Sequence[Path], out: Path, settings: TwinSettings, jobs: int 
     return made
 
 
+@contextmanager
+def twins_of(runs: Sequence[Path], settings: TwinSettings, jobs: int = 1) -> Iterator[list[Path]]:
+    """Twins of all runs for as long as the context is open. A command that is killed leaves those that are finished,
+    and goes on with them when it is started again: their folder is named by the runs and settings."""
+    from gpvo.io.snapshot import digest_of
+
+    key = digest_of([str(run.resolve()) for run in runs], asdict(settings))[:16]
+    folder = Path(gettempdir()) / f"gpvo-twins-{key}"
+    with ExitStack() as stack:
+        try:
+            folder.mkdir(mode=0o700, exist_ok=True)
+            place = folder.lstat()
+            if not S_ISDIR(place.st_mode) or (hasattr(os, "getuid") and place.st_uid != os.getuid()):
+                raise OutputError("is somebody else's", where=folder)
+            stack.enter_context(FolderLock(folder))
+        except (OSError, OutputError):  # or the same command runs already
+            folder = Path(stack.enter_context(TemporaryDirectory(prefix="gpvo-twins-")))
+        try:
+            yield make_all(runs, folder, settings, jobs)
+        except Exception:
+            shutil.rmtree(folder, ignore_errors=True)
+            raise
+        shutil.rmtree(folder, ignore_errors=True)
+
+
 def say_simulated(about: Mapping[str, Any]) -> None:
     """The line above every table whose truth comes from twins."""
     name, twins, tolerance = about["of"], about["twins"], about["tolerance_name"]
@@ -162,5 +191,5 @@ def in_place_of_runs_without_truth(
             without.append(path)
         else:
             note(f"gpvo: {run.name} has ground truth: no twins are made of it")
-    with TemporaryDirectory(prefix="gpvo-twins-") as folder:
-        yield [p for p in paths if p not in without] + make_all(without, Path(folder), settings, jobs)
+    with twins_of(without, settings, jobs) as made:
+        yield [p for p in paths if p not in without] + made
