@@ -50,15 +50,15 @@ def predict(
     targets = [out] if len(runs) == 1 else [out / f"{name}.parquet" for name in names]
     for target in targets:
         refuse_foreign(target, *PREDICTIONS)  # before the work, not after it
-    predictor, documents = Predictor.load(model), []
+    predictor, documents = Predictor.load(model), list[dict[str, Any]]()
     with progress("runs", len(runs)) as advance:
         for path, target in zip(runs, targets, strict=True):
             run = read_run(path)
             warn_of_misfits(model, predictor, run)
             predictor.reset(run.log.camera, vehicle=run.log.vehicle)
-            told = _Summary()
-            write_predictions(target, told.of(p for p in map(predictor.step, run.log) if p is not None))
-            documents.append({"run": str(path), "file": str(target), **told.document()})
+            documents.append({"run": str(path), "file": str(target)})
+            stated = (p for p in map(predictor.step, run.log) if p is not None)
+            write_predictions(target, _summary(stated, documents[-1]))
             advance()
     if json_:
         print_json({"schema": 1, **({"runs": documents} if len(runs) > 1 else documents[0])})
@@ -72,28 +72,18 @@ def predict(
         print("no motion was measured" if d["in_domain"] is None else known)
 
 
-class _Summary:
-    """What is told of predictions that pass by."""
-
-    def __init__(self) -> None:
-        self._count, self._sigma, self._inside = 0, array("d"), bytearray()
-
-    def of(self, predictions: Iterable[Prediction]) -> Iterator[Prediction]:
-        """The same predictions."""
-        for p in predictions:
-            self._count += 1
-            if p.measured:
-                self._sigma.frombytes(p.sigma.tobytes())
-                self._inside.append(p.in_domain > 0.5)
-            yield p
-
-    def document(self) -> dict[str, Any]:
-        sigma = np.median(np.reshape(self._sigma, (-1, 6)), axis=0) if self._inside else np.full(6, np.nan)
-        return {
-            "predictions": self._count,
-            "in_domain": float(np.mean(list(self._inside))) if self._inside else None,
-            "median_sigma": {"translation_m": sigma[:3], "rotation_rad": sigma[3:]},
-        }
+def _summary(passing: Iterable[Prediction], told: dict[str, Any]) -> Iterator[Prediction]:
+    """The same predictions; at their end, ``told`` sums them up."""
+    count, sigmas, inside = 0, array("d"), bytearray()
+    for p in passing:
+        count += 1
+        if p.measured:
+            sigmas.frombytes(p.sigma.tobytes())
+            inside.append(p.in_domain > 0.5)
+        yield p
+    sigma = np.median(np.reshape(sigmas, (-1, 6)), axis=0) if inside else np.full(6, np.nan)
+    told["predictions"], told["in_domain"] = count, float(np.mean(list(inside))) if inside else None
+    told["median_sigma"] = {"translation_m": sigma[:3], "rotation_rad": sigma[3:]}
 
 
 def check(model: Model, run: Annotated[Path, "Run folder."], json_: Json = False) -> None:

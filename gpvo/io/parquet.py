@@ -14,7 +14,7 @@ from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from tempfile import SpooledTemporaryFile
-from typing import IO, TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -73,8 +73,13 @@ def write_blocks(
     """The same file of the rows of all blocks, one of which is in memory at a time, or a single column of all; a column
     that a block lacks is null there."""
     rows, end, place, parts = 0, len(_MAGIC), [], dict[str, list[tuple[int, int, int, int]]]()
-    # A page begins with which of its values there are, and is known only at the end.
-    with replacing(path, own) as temporary, _spool(path) as spool, temporary.open("wb") as file:
+    # A page begins with which of its values there are, and so is known only at the end. Nameless, the room for the
+    # blocks goes with the process, however it ends.
+    with (
+        SpooledTemporaryFile(_SPOOL_BYTES, dir=str(path.parent)) as spool,
+        replacing(path, own) as temporary,
+        temporary.open("wb") as file,
+    ):
         for block in blocks:
             count = 0
             for name, values in block.items():
@@ -96,12 +101,6 @@ def write_blocks(
         group = RowGroup(path, rows, tuple(parts), np.array(place, dtype=np.int64).reshape(-1, 3))
         file.write(_footer([group], metadata))
     return group
-
-
-def _spool(path: Path) -> IO[bytes]:
-    """Room for what does not fit into memory, on the disk of ``path``; nameless, so that a killed process leaves
-    none."""
-    return SpooledTemporaryFile(_SPOOL_BYTES, dir=str(path.parent))
 
 
 def join_tables(parts: Sequence[RowGroup], target: Path, metadata: Mapping[str, str] | None = None) -> None:

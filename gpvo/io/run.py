@@ -31,18 +31,8 @@ from gpvo.io.run_folder import is_finished
 from gpvo.io.run_read import SCHEMA, Run, read_predictions, read_run, read_tracks, table_of
 from gpvo.io.snapshot import save_snapshot
 from gpvo.io.trajectory import tum_line
-from gpvo.types import (
-    Array,
-    ImuLog,
-    Mounting,
-    Prediction,
-    StereoCamera,
-    StereoTracks,
-    TruthLog,
-    VoLog,
-    VoRecord,
-    batches,
-)
+from gpvo.types import Array, ImuLog, Mounting, Prediction, StereoCamera, StereoTracks, TruthLog, VoLog, VoRecord
+from gpvo.types.records import batches
 
 __all__ = [
     "Run",

@@ -22,7 +22,8 @@ from gpvo.errors import GpvoError
 from gpvo.geometry.covariance import variances
 from gpvo.online.features import AXES
 from gpvo.publish.odometry import Odometry
-from gpvo.types import Array, batches
+from gpvo.types import Array
+from gpvo.types.records import batches
 
 CONSUMERS = ("px4", "ardupilot", "robot_localization", "fusioncore")
 
@@ -118,14 +119,6 @@ class Check:
             raise GpvoError("no frame of this run has a motion to publish")
         told = [np.concatenate(parts) for parts in zip(*self._seen, strict=True)]
         return _CHECKS[self._consumer](*told)
-
-
-def check(odometry: Iterable[Odometry], consumer: str) -> list[Verdict]:
-    """What ``consumer`` will do with these messages. Raises GpvoError as :class:`Check`."""
-    found = Check(consumer)
-    for _ in found.passing(odometry):
-        pass
-    return found.verdicts()
 
 
 def _check_robot_localization(pose: Array, twist: Array) -> list[Verdict]:
@@ -237,9 +230,6 @@ def _verdict(
     return Verdict(quantity, name, value, hidden, axes, advice)
 
 
-_CHECKS: dict[str, Callable[..., list[Verdict]]] = {
-    "px4": _check_px4,
-    "ardupilot": _check_ardupilot,
-    "robot_localization": _check_robot_localization,
-    "fusioncore": _check_fusioncore,
-}
+_CHECKS: dict[str, Callable[..., list[Verdict]]] = dict(
+    zip(CONSUMERS, (_check_px4, _check_ardupilot, _check_robot_localization, _check_fusioncore), strict=True)
+)

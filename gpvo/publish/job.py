@@ -88,20 +88,9 @@ def publish_run(path: Path, settings: PublishSettings) -> Published:
     consumer = settings.consumer or ("px4" if settings.to == "mavlink" else "robot_localization")
     passed = _Passed(run, settings.to, consumers.Check(consumer) if settings.check else None)
     out, count = _write(run, passed.of(odometry_of(run, stated, settings)), settings)
-    return Published(
-        run=run.name,
-        to=settings.to,
-        out=out,
-        messages=count,
-        lost=passed.lost,
-        outside=passed.refused - passed.lost,
-        source=source,
-        consumer=consumer if settings.check else None,
-        is_placed=run.mounting.T_body_cam is not None,
-        body=run.mounting.body,
-        of_poses=run.log.camera is None,
-        verdicts=passed.verdicts,
-    )
+    placed, body, of_poses = run.mounting.T_body_cam is not None, run.mounting.body, run.log.camera is None
+    of = passed.lost, passed.refused - passed.lost, source, consumer if settings.check else None, placed, body, of_poses
+    return Published(run.name, settings.to, out, count, *of, passed.verdicts)
 
 
 def _stated(

@@ -16,7 +16,6 @@ from gpvo.types.records import (
     StoredRecords,
     VoLog,
     VoRecord,
-    batches,
     frequent_reasons,
 )
 from gpvo.types.sensors import (
@@ -68,7 +67,6 @@ __all__ = [
     "Vehicle",
     "VoLog",
     "VoRecord",
-    "batches",
     "field_names",
     "frequent_reasons",
     "out_of_limits",

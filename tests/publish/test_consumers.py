@@ -8,6 +8,7 @@ src/ros_filter.cpp and src/ekf.cpp.
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -24,6 +25,13 @@ from synthetic_flights import ErrorLaw, synthetic_flight
 def odometry() -> list[Odometry]:
     flight = synthetic_flight(5, duration_s=5, law=ErrorLaw(burst_factor=10.0))
     return list(messages(flight.records, flight.predictions, OdometryBuilder()))[1:]
+
+
+def check(odometry: Sequence[Odometry], consumer: str) -> list[consumers.Verdict]:
+    """As publishing asks, while the messages are written."""
+    found = consumers.Check(consumer)
+    assert [o.t_ns for o in found.passing(odometry)] == [o.t_ns for o in odometry]
+    return found.verdicts()
 
 
 def _px4_intake(wire: list[float], floor: float) -> list[float]:
@@ -78,29 +86,29 @@ def test_robot_localization_floors_and_takes_absolutes() -> None:
 
 def test_check_names_the_parameter_that_hides_the_prediction(odometry: list[Odometry]) -> None:
     calm = [replace(o, twist_covariance=np.eye(6) * 0.02**2) for o in odometry]
-    velocity = next(v for v in consumers.check(calm, "px4") if v.quantity == "velocity")
+    velocity = next(v for v in check(calm, "px4") if v.quantity == "velocity")
     assert velocity.hidden_percent == 100.0
     assert "Set EKF2_EVV_NOISE to 0.02" in str(velocity)
     loud = [replace(o, twist_covariance=np.eye(6)) for o in odometry]
-    velocity = next(v for v in consumers.check(loud, "px4") if v.quantity == "velocity")
+    velocity = next(v for v in check(loud, "px4") if v.quantity == "velocity")
     assert velocity.hidden_percent == 0.0
     assert not velocity.advice
     tiny = [replace(o, twist_covariance=np.eye(6) * 1e-3**2) for o in odometry]
-    velocity = next(v for v in consumers.check(tiny, "px4") if v.quantity == "velocity")
+    velocity = next(v for v in check(tiny, "px4") if v.quantity == "velocity")
     assert "Set EKF2_EVV_NOISE to 0.01, the smallest it accepts, which hides an axis in 100 %" in velocity.advice
     part = [replace(o, twist_covariance=np.eye(6) * (1e-3 if k % 4 else 2e-2) ** 2) for k, o in enumerate(odometry)]
-    velocity = next(v for v in consumers.check(part, "px4") if v.quantity == "velocity")
+    velocity = next(v for v in check(part, "px4") if v.quantity == "velocity")
     hidden = 100 * np.mean([k % 4 > 0 for k in range(len(odometry))])
     assert velocity.advice.endswith(f"which hides an axis in {hidden:.0f} %")
 
 
 def test_check_of_the_others(odometry: list[Odometry]) -> None:
-    ardupilot = [str(v) for v in consumers.check(odometry, "ardupilot")]
+    ardupilot = [str(v) for v in check(odometry, "ardupilot")]
     assert any("VISO_POS_M_NSE" in line for line in ardupilot)
     assert any("VISION_SPEED_ESTIMATE" in line and "VISO_QUAL_MIN" in line for line in ardupilot)
     # EKF3 takes no less than 5 degrees of yaw, 1 cm and 5 cm/s: to set a parameter lower changes nothing.
     still = [replace(o, pose_covariance=np.eye(6) * 1e-6, twist_covariance=np.eye(6) * 1e-4) for o in odometry]
-    position, _, angle, _, speed, velocity = consumers.check(still, "ardupilot")
+    position, _, angle, _, speed, velocity = check(still, "ardupilot")
     assert "Set VISO_POS_M_NSE to 0.01, the smallest it accepts" in position.advice
     assert "Set VISO_YAW_M_NSE to 0.087, the smallest it accepts" in angle.advice
     assert "set VISO_VEL_M_NSE to 0.05;" in velocity.advice
@@ -109,30 +117,30 @@ def test_check_of_the_others(odometry: list[Odometry]) -> None:
     assert speed.hidden_percent == 100.0
     assert speed.axes[0].predicted_sigma == pytest.approx(((3e-4) ** 0.5,) * 3)
     loud = [replace(o, twist_covariance=np.eye(6) * 0.06**2) for o in odometry]
-    assert consumers.check(loud, "ardupilot")[4].hidden_percent == 0.0
-    assert all(v.hidden_percent == 0 for v in consumers.check(odometry, "robot_localization"))
+    assert check(loud, "ardupilot")[4].hidden_percent == 0.0
+    assert all(v.hidden_percent == 0 for v in check(odometry, "robot_localization"))
     lifted = [replace(o, twist_covariance=lift(np.eye(6) * 1e-12, 1e-9)) for o in odometry]
-    assert [v.hidden_percent for v in consumers.check(lifted, "robot_localization")] == [100.0, 100.0, 0.0, 0.0]
+    assert [v.hidden_percent for v in check(lifted, "robot_localization")] == [100.0, 100.0, 0.0, 0.0]
     for axis in range(6):  # it floors each of them
         one = [replace(o, twist_covariance=np.diag(np.where(np.arange(6) == axis, 1e-12, 1.0))) for o in odometry]
-        verdicts = consumers.check(one, "robot_localization")
+        verdicts = check(one, "robot_localization")
         hidden = [a.hidden_percent for v in verdicts for a in v.axes]
         assert hidden == [100.0 * (k == axis) for k in range(12)]
         assert [v.hidden_percent for v in verdicts] == [100.0 * (axis < 3), 100.0 * (axis >= 3), 0.0, 0.0]
     with pytest.raises(GpvoError, match="unknown consumer"):
-        consumers.check(odometry, "betaflight")
+        check(odometry, "betaflight")
 
 
 def test_a_check_speaks_of_each_axis_and_mixes_no_units(odometry: list[Odometry]) -> None:
     """The smallest axis was shown as the sigma, and what hides it as what hides all."""
     sigma = np.array([0.05, 0.2, 0.3, 0.001, 0.002, 0.003])
     frames = [replace(o, twist_covariance=np.diag(sigma**2)) for o in odometry]
-    velocity = str(consumers.check(frames, "px4")[0])
+    velocity = str(check(frames, "px4")[0])
     assert "x 0.05 / 0.05 / 0.05 m/s, y 0.2 / 0.2 / 0.2 m/s, z 0.3 / 0.3 / 0.3 m/s (5, 50, 95 %)" in velocity
     assert "hides x in 100 %, y in 0 %, z in 0 % of frames. Set EKF2_EVV_NOISE to 0.05" in velocity
-    twist = str(consumers.check(frames, "fusioncore")[0])
+    twist = str(check(frames, "fusioncore")[0])
     assert "vx 0.05 / 0.05 / 0.05 m/s, vy 0.2 / 0.2 / 0.2 m/s, yaw rate 0.003 / 0.003 / 0.003 rad/s" in twist
-    told = [str(v) for v in consumers.check(frames, "robot_localization")]
+    told = [str(v) for v in check(frames, "robot_localization")]
     assert [line.split(":")[0] for line in told] == ["velocity", "turn rate", "position", "orientation"]
 
 
@@ -151,10 +159,10 @@ def test_check_reads_of_each_axis_what_the_consumer_reads(odometry: list[Odometr
         "fusioncore": [0.02, 0.03, 6.0, *of_pose],
     }
     for consumer, sigmas in middle.items():
-        found = consumers.check(frames, consumer)
+        found = check(frames, consumer)
         assert [a.predicted_sigma[1] for v in found for a in v.axes] == pytest.approx(sigmas, rel=0.02)
     # A velocity's sigma has a usual level, whose low end must not be hidden; of a pose's, which grows, the middle.
-    velocity, position, yaw = consumers.check(frames, "px4")
+    velocity, position, yaw = check(frames, "px4")
     assert "hides it in 100 % of frames" in str(velocity)
     assert "x 0.165 / 0.3 / 0.435 m, y" in str(position)
     assert "Set EKF2_EVV_NOISE to 0.011" in velocity.advice
@@ -170,7 +178,7 @@ def test_fusioncore_floors_a_pose_and_replaces_what_holds_a_zero(odometry: list[
     C[2, 2] = 0.0
     np.testing.assert_allclose(consumers.fusioncore_sigmas(C), [0.1, 0.1, 0.1, 0.02, 0.02, 0.02])
     sharp = [replace(o, twist_covariance=np.eye(6), pose_covariance=np.eye(6) * 1e-8) for o in odometry]
-    twist, pose = consumers.check(sharp, "fusioncore")
+    twist, pose = check(sharp, "fusioncore")
     assert (twist.hidden_percent, pose.hidden_percent) == (0.0, 100.0)
     assert all(a.predicted_sigma == pytest.approx((1e-4, 1e-4, 1e-4)) for a in pose.axes)
 
@@ -182,6 +190,6 @@ def test_fusioncore_loses_what_lies_in_correlations(odometry: list[Odometry]) ->
         R = np.eye(6)
         R[0, 5] = R[5, 0] = correlation
         slanted = [replace(o, twist_covariance=R, pose_covariance=np.eye(6)) for o in odometry]
-        assert [v.hidden_percent for v in consumers.check(slanted, "fusioncore")] == [hidden, 0.0]
-    assert "use of the diagonal alone hides it in 100 %" in str(consumers.check(slanted, "fusioncore")[0])
-    assert "send no zeros" in str(consumers.check(slanted, "fusioncore")[0])
+        assert [v.hidden_percent for v in check(slanted, "fusioncore")] == [hidden, 0.0]
+    assert "use of the diagonal alone hides it in 100 %" in str(check(slanted, "fusioncore")[0])
+    assert "send no zeros" in str(check(slanted, "fusioncore")[0])
