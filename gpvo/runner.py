@@ -89,7 +89,9 @@ def run(
     odometry = StereoOdometry(source.camera, config, source.mask, calibration_state, source.mounting.T_imu_cam)
     of_model = "" if predictor is None else predictor.digest
     key = None if options is None else digest_of(options, of_model, keep_tracks, odometry, *_content(source))
+    begun: list[RunWriter] = []
     with (
+        _gone_on_with(begun),
         RunWriter(
             out,
             overwrite=overwrite,
@@ -102,8 +104,8 @@ def run(
             calibration=source.calibration,
             resume=key,
         ) as writer,
-        _gone_on_with(writer),
     ):
+        begun.append(writer)
         done = [] if writer.kept is None else writer.kept.records
         if writer.kept is not None:
             odometry, recorder = writer.kept.state
@@ -135,16 +137,18 @@ def run(
 
 
 @contextmanager
-def _gone_on_with(writer: RunWriter) -> Iterator[None]:
-    """What fails after the state of an interrupted run was taken up may be that state's fault: it is a file as any."""
+def _gone_on_with(begun: list[RunWriter]) -> Iterator[None]:
+    """What fails after the state of an interrupted run was taken up, to the closing of its files, may be that state's
+    fault: it is a file as any."""
     try:
         yield
     except Exception as error:
-        if writer.kept is None or isinstance(error, (GpvoError, OSError)):
+        kept = [writer for writer in begun if writer.kept is not None]
+        if not kept or isinstance(error, (GpvoError, OSError)):
             raise
         reason = f"{type(error).__name__}: {error}"
         cure = "remove the folder to start afresh"
-        raise SourceError(f"cannot be resumed: {reason}", where=writer.path, cure=cure) from error
+        raise SourceError(f"cannot be resumed: {reason}", where=kept[0].path, cure=cure) from error
 
 
 @dataclass(frozen=True)

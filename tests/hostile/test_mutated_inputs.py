@@ -16,7 +16,7 @@ import cv2
 import numpy as np
 import pytest
 from bag_maker import stereo_bag
-from campaign import CAMERA, READERS
+from campaign import CAMERA, READERS, bytes_of, read_broken_run
 from gpvo import runner
 from gpvo.cli import app
 from gpvo.files import write_json
@@ -27,6 +27,7 @@ from gpvo.io.trajectory import write_tum
 from gpvo.online.predictor import Predictor
 from gpvo.sim.points import simulate_points
 from gpvo.types import TruthLog, VoLog
+from gpvo.vo.odometry import StereoOdometry
 from gpvo.vo.rig_error import RigState
 from gpvo.vo.rig_findings import document
 from synthetic_runs import make_run
@@ -103,7 +104,7 @@ def _newer(root: Path, log: VoLog, truth: TruthLog) -> None:
 
 
 def _broken(path: Path) -> None:
-    """A run that broke off in its third chunk."""
+    """A run that broke off when its third chunk was whole."""
     path.mkdir()
     source = simulate_points("tunnel-bursts", 1, duration_s=0.6, rate_hz=10.0).save(path / "source.npz")
     left = iter(range(5))
@@ -114,6 +115,7 @@ def _broken(path: Path) -> None:
 
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(runner, "RunWriter", partial(RunWriter, chunk=2))
+        patch.setattr(runner, "_content", bytes_of)
         with pytest.raises(KeyboardInterrupt):
             runner.run(open_source(source), path / "run", on_frame=stop, keep_tracks=True, options={})
     assert (path / "run" / "chunks" / "state.npz").is_file()
@@ -167,6 +169,15 @@ def test_every_seed_is_read_as_it_is(seeds: Path, tmp_path: Path) -> None:
     for kind, (read, _) in READERS.items():
         for path in (copied / kind).iterdir():
             read(path)
+
+
+def test_a_broken_run_that_was_copied_is_gone_on_with(seeds: Path, tmp_path: Path, monkeypatch) -> None:
+    """Else its state would never be read, whatever has become of it."""
+    frames = []
+    step = StereoOdometry.step
+    monkeypatch.setattr(StereoOdometry, "step", lambda *a: frames.append(a) or step(*a))
+    read_broken_run(shutil.copytree(seeds / "broken run" / "folder", tmp_path / "folder"))
+    assert len(frames) == 1  # of seven: three chunks of two were kept
 
 
 def test_no_mutated_input_breaks_anything(seeds: Path) -> None:

@@ -291,7 +291,7 @@ def test_a_source_that_changed_is_told(tmp_path: Path, monkeypatch: pytest.Monke
         list(runner.steps(source, runner.VoConfig(), done=shifted))
 
 
-def broken_off(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+def broken_off(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, *, keep_tracks: bool = False) -> Path:
     """The source of a run that broke off after two chunks."""
     monkeypatch.setattr(runner, "RunWriter", partial(RunWriter, chunk=5))
     path, left = tracks(tmp_path), iter(range(13))
@@ -301,7 +301,7 @@ def broken_off(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
             raise KeyboardInterrupt
 
     with pytest.raises(KeyboardInterrupt):
-        runner.run(open_source(path), tmp_path / "run", on_frame=stop, options={})
+        runner.run(open_source(path), tmp_path / "run", on_frame=stop, options={}, keep_tracks=keep_tracks)
     return path
 
 
@@ -324,13 +324,20 @@ def test_chunks_with_motions_that_cannot_be_are_not_gone_on_with(
     assert len(went) == len(read_run(tmp_path / "run").log)
 
 
-def test_a_state_that_cannot_be_is_refused_in_one_line(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    path, state = broken_off(tmp_path, monkeypatch), tmp_path / "run" / "chunks" / "state.npz"
+@pytest.mark.parametrize("noticed", ["in a motion", "when it is written"])
+def test_a_state_that_cannot_be_is_refused_in_one_line(
+    noticed: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    path, state = broken_off(tmp_path, monkeypatch, keep_tracks=True), tmp_path / "run" / "chunks" / "state.npz"
     with np.load(state) as file:
         tree, data = json.loads(file["tree"].tobytes()), file["data"]
     _, made_by = tree["state"]["tuple"]
-    made_by["tuple"][0]["fields"]["_state"]["fields"]["t_last_ns"] = "x"
+    odometry, recorder = (of["fields"] for of in made_by["tuple"])
+    if noticed == "in a motion":
+        odometry["_state"]["fields"]["t_last_ns"] = "x"
+    else:
+        recorder["_begun"] = 2**40  # tracks are numbered with 32 bits
     np.savez(state, tree=np.frombuffer(json.dumps(tree).encode(), np.uint8), data=data)
     with pytest.raises(SourceError, match=r"run: cannot be resumed: [A-Z]") as refusal:
-        runner.run(open_source(path), tmp_path / "run", options={})
+        runner.run(open_source(path), tmp_path / "run", options={}, keep_tracks=True)
     assert "\n" not in str(refusal.value)
