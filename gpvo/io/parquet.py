@@ -12,6 +12,7 @@ import zlib
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
+from functools import cache
 from pathlib import Path
 from tempfile import SpooledTemporaryFile
 from typing import TYPE_CHECKING, Any
@@ -41,10 +42,14 @@ _LEVEL = 1  # of gzip: covariances hardly shrink further
 MAX_COLUMNS = 4096
 MAX_BYTES = 8_000_000_000
 _BLOCK_ROWS, _SPOOL_BYTES = 2_000, 4_000_000
+_FEW_ROWS = 1_000  # for few rows, threads cost more than they save
 _MOST_GROUPS = 1000  # of rows: what a file says of each column of each takes 1 kB to write and to read
 _PLAIN_BYTES, _MAX_RATIO = 200_000_000, 200
 _LARGEST = np.float64(1e100)  # No number of a run is larger: products of two or three stay finite.
-_Struct = dict[int, Any]  # of Thrift: by ids that rise by less than 16, numbers, texts, structures, and lists of these
+# Of Thrift: by ids that rise by less than 16, numbers, texts, structures, as bytes where they are encoded, and lists of
+# these.
+_Struct = dict[int, Any]
+_BYTE = [bytes([k]) for k in range(256)]
 
 
 @dataclass(frozen=True)
@@ -166,23 +171,32 @@ def _encoded(values: Any, kind: str) -> tuple[NDArray[np.bool_], bytes]:
 
 def _footer(groups: Sequence[RowGroup], metadata: Mapping[str, str] | None) -> bytes:
     names = groups[0].names
-    schema: list[_Struct] = [{4: "schema", 5: len(names)}]
-    for name in names:
-        kind = KIND_OF.get(name, "float64")
-        schema.append({1: _TYPE[kind], 3: _OPTIONAL, 4: name} | ({6: _UTF8} if kind == "string" else {}))
+    schema = [_thrift({4: "schema", 5: len(names)})[1], *map(_described, names)]
     told = [{1: key, 2: text} for key, text in (metadata or {}).items()]
     rows = _Long(sum(g.rows for g in groups))
     body = _thrift({1: 2, 2: schema, 3: rows, 4: [_group(g) for g in groups], 5: told, 6: "gpvo"})[1]
     return body + struct.pack("<I", len(body)) + _MAGIC
 
 
+@cache
+def _described(name: str) -> bytes:
+    """What the schema says of a column."""
+    kind = KIND_OF.get(name, "float64")
+    return _thrift({1: _TYPE[kind], 3: _OPTIONAL, 4: name} | ({6: _UTF8} if kind == "string" else {}))[1]
+
+
+@cache
+def _encoding(name: str) -> bytes:
+    """What a group says of a column wherever it lies: the first four fields."""
+    return _fields({1: _TYPE[KIND_OF.get(name, "float64")], 2: [_PLAIN, _RLE], 3: [name], 4: _GZIP})
+
+
 def _group(group: RowGroup) -> _Struct:
-    columns: list[_Struct] = []
+    columns, rows = list[bytes](), _Long(group.rows)
     for name, place in zip(group.names, group.place.tolist()):
         offset, size, plain = map(_Long, place)
-        about = {1: _TYPE[KIND_OF.get(name, "float64")], 2: [_PLAIN, _RLE], 3: [name], 4: _GZIP}
-        about |= {5: _Long(group.rows), 6: plain, 7: size, 9: offset}
-        columns.append({2: offset, 3: about})
+        about = _encoding(name) + _fields({5: rows, 6: plain, 7: size, 9: offset}, before=4) + b"\x00"
+        columns.append(_fields({2: offset, 3: about}) + b"\x00")
     return {1: columns, 2: _Long(group.place[:, 2].sum()), 3: _Long(group.rows)}
 
 
@@ -192,26 +206,33 @@ class _Long(int):
 
 def _thrift(value: Any) -> tuple[int, bytes]:
     """Thrift's number for the type of a value, and the value in its compact protocol."""
+    if isinstance(value, int):
+        return 6 if isinstance(value, _Long) else 5, _varint(value << 1 ^ value >> 63)  # zigzag
+    if isinstance(value, bytes):
+        return 12, value
     if isinstance(value, dict):
-        out, before = [], 0
-        for number, held in value.items():
-            kind, data = _thrift(held)
-            out.append(bytes([(number - before) << 4 | kind]) + data)
-            before = number
-        return 12, b"".join(out) + b"\x00"
+        return 12, _fields(value) + b"\x00"
     if isinstance(value, str):
         text = value.encode()
         return 8, _varint(len(text)) + text
-    if isinstance(value, list):
-        kinds, entries = zip(*map(_thrift, value)) if value else ((12,), ())
-        head = (
-            bytes([len(value) << 4 | kinds[0]]) if len(value) < 15 else bytes([0xF0 | kinds[0]]) + _varint(len(value))
-        )
-        return 9, head + b"".join(entries)
-    return 6 if isinstance(value, _Long) else 5, _varint(value << 1 ^ value >> 63)  # zigzag
+    kinds, entries = zip(*map(_thrift, value)) if value else ((12,), ())
+    head = bytes([len(value) << 4 | kinds[0]]) if len(value) < 15 else bytes([0xF0 | kinds[0]]) + _varint(len(value))
+    return 9, head + b"".join(entries)
+
+
+def _fields(values: _Struct, before: int = 0) -> bytes:
+    """Fields of a structure, that follow the one with this id."""
+    out = []
+    for number, held in values.items():
+        kind, data = _thrift(held)
+        out.append(_BYTE[(number - before) << 4 | kind] + data)
+        before = number
+    return b"".join(out)
 
 
 def _varint(value: int) -> bytes:
+    if value <= 0x7F:
+        return _BYTE[value]
     out = bytearray()
     while value > 0x7F:
         out.append(value & 0x7F | 0x80)
@@ -226,7 +247,7 @@ def read_columns(path: Path) -> tuple[dict[str, NDArray[Any]], dict[str, str]]:
     """
     with _opened(path) as file:
         metadata = {k.decode(): v.decode(errors="replace") for k, v in (file.schema_arrow.metadata or {}).items()}
-        return _columns(file.read()), metadata
+        return _columns(file.read(use_threads=file.metadata.num_rows > _FEW_ROWS)), metadata
 
 
 def read_blocks(path: Path) -> Iterator[dict[str, NDArray[Any]]]:
@@ -237,7 +258,7 @@ def read_blocks(path: Path) -> Iterator[dict[str, NDArray[Any]]]:
         left = file.metadata.num_rows
         if not left:
             yield _columns(file.read())
-        for block in file.iter_batches(_BLOCK_ROWS):
+        for block in file.iter_batches(_BLOCK_ROWS, use_threads=left > _FEW_ROWS):
             left -= block.num_rows
             yield _columns(pa.Table.from_batches([block]))
         if left:
@@ -284,7 +305,7 @@ def _opened(path: Path) -> Iterator[pq.ParquetFile]:
 
 
 def _columns(table: pa.Table) -> dict[str, NDArray[Any]]:
-    return {name: _to_numpy(name, table[name]) for name in table.column_names}
+    return {name: _to_numpy(name, column) for name, column in zip(table.column_names, table.itercolumns())}
 
 
 def placed_columns(path: Path) -> RowGroup:
@@ -300,14 +321,15 @@ def placed_columns(path: Path) -> RowGroup:
 def _to_numpy(name: str, column: pa.ChunkedArray) -> NDArray[Any]:
     import pyarrow as pa
 
-    wanted = KIND_OF.get(name, "float64")
-    is_number = pa.types.is_integer(column.type) or pa.types.is_floating(column.type) or pa.types.is_null(column.type)
-    if wanted != "string" and not is_number and not (wanted == "bool" and pa.types.is_boolean(column.type)):
-        raise ValueError(f"the column '{name}' holds {column.type}, not {wanted}")
-    if pa.types.is_string(column.type) or pa.types.is_large_string(column.type) or pa.types.is_dictionary(column.type):
+    wanted, kind = KIND_OF.get(name, "float64"), column.type
+    is_number = pa.types.is_floating(kind) or pa.types.is_integer(kind) or pa.types.is_null(kind)
+    if wanted != "string" and not is_number and not (wanted == "bool" and pa.types.is_boolean(kind)):
+        raise ValueError(f"the column '{name}' holds {kind}, not {wanted}")
+    if not is_number and (pa.types.is_string(kind) or pa.types.is_large_string(kind) or pa.types.is_dictionary(kind)):
         return np.array(column.to_pylist(), dtype=object)
     values = numbers_of(column)
-    if values.dtype.kind == "f" and (np.isfinite(values) & (np.abs(values) > _LARGEST)).any():
+    large = np.abs(values) > _LARGEST if values.dtype.kind == "f" else None
+    if large is not None and large.any() and np.isfinite(values[large]).any():
         raise ValueError(f"the column '{name}' holds a number beyond {_LARGEST:g}")
     return values
 
