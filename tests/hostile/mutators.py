@@ -5,6 +5,7 @@ from __future__ import annotations
 import copy
 import json
 import re
+from functools import cache
 from pathlib import Path
 from typing import Any
 
@@ -43,11 +44,17 @@ def splice(raw: bytes, rng: Rng, other: bytes) -> bytes:
 
 
 def numbers(raw: bytes, rng: Rng, other: bytes) -> bytes:
-    found = list(_NUMBER.finditer(raw))
+    found = _numbers_in(raw)
     if not found:
         return flip(raw, rng, other)
-    hit = found[int(rng.integers(len(found)))]
-    return raw[: hit.start()] + EXTREME[int(rng.integers(len(EXTREME)))] + raw[hit.end() :]
+    start, end = found[int(rng.integers(len(found)))]
+    return raw[:start] + EXTREME[int(rng.integers(len(EXTREME)))] + raw[end:]
+
+
+@cache
+def _numbers_in(raw: bytes) -> list[tuple[int, int]]:
+    """Where the numbers of a seed lie, of which there are few."""
+    return [hit.span() for hit in _NUMBER.finditer(raw)]
 
 
 def swap(raw: bytes, rng: Rng, other: bytes) -> bytes:
@@ -129,8 +136,8 @@ def odd_model(path: Path, rng: Rng) -> None:
     from gpvo.errors import ModelError
     from gpvo.online import modelfile
 
-    arrays, header = modelfile.load(path)
-    arrays, names = dict(arrays), sorted(n for n in arrays if not n.startswith("thesis."))
+    arrays, header = _loaded(path.read_bytes())
+    arrays, header, names = dict(arrays), dict(header), sorted(n for n in arrays if not n.startswith("thesis."))
     if rng.random() < 0.3:
         key = sorted(header)[int(rng.integers(len(header)))]
         header[key] = (None, -1, 0, [], {}, "x", [1.0], [[]], {"x": {}}, 1e300, True)[int(rng.integers(11))]
@@ -143,11 +150,19 @@ def odd_model(path: Path, rng: Rng) -> None:
         path.write_bytes(flip(path.read_bytes(), rng, b""))
 
 
+@cache
+def _loaded(raw: bytes) -> tuple[dict[str, np.ndarray], dict[str, Any]]:
+    """A seed's arrays and header, neither of which may be changed."""
+    from gpvo.online import modelfile
+
+    return modelfile.parse(raw, Path("model.gpvo"))
+
+
 def odd_table(path: Path, rng: Rng) -> None:
     import pyarrow as pa
     import pyarrow.parquet as pq
 
-    table = pq.ParquetFile(path).read()
+    table = pq.ParquetFile(path).read(use_threads=False)
     at = int(rng.integers(table.num_columns))
     name = table.column_names[at]
     if rng.random() < 0.2:
