@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
+from typing import Any, NamedTuple
 
 import numpy as np
 import pytest
@@ -26,17 +27,24 @@ KEPT = {
 }
 
 
+class Flown(NamedTuple):
+    """A run, what its tracks keep, and the scenario found in it."""
+
+    path: Path
+    kind: str
+    found: dict[str, Any]
+
+
 @pytest.fixture(scope="module", params=KEPT)
-def flown(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, str]:
+def flown(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory) -> Flown:
     folder = tmp_path_factory.mktemp("like")
     flight = simulate_points("street", 3, duration_s=20.0, speed_mps=12.0, **MADE, **KEPT[request.param])
     run_vo(open_source(flight.save(folder / "f.npz")), folder / "run", keep_tracks=True)
-    return folder / "run", request.param
+    return Flown(folder / "run", request.param, like(folder / "run"))
 
 
-def test_noise_counts_and_camera_come_back(flown: tuple[Path, str]) -> None:
-    path, kind = flown
-    found = like(path)
+def test_noise_counts_and_camera_come_back(flown: Flown) -> None:
+    _, kind, found = flown
     kept = {"persistent_px": 0.0, "drift_px": 0.0, **KEPT[kind]}
     # A twentieth of the tracks are outliers, which no odometry tells from noise to the last one.
     if kind != "drift":
@@ -79,9 +87,9 @@ def test_each_frame_has_as_many_points_as_that_of_the_run(tmp_path: Path) -> Non
     )
 
 
-def test_the_flight_is_flown_again(flown: tuple[Path, str]) -> None:
-    path, _ = flown
-    scenario = points_scenario(load_scenario("street", like(path)))
+def test_the_flight_is_flown_again(flown: Flown) -> None:
+    path, _, found = flown
+    scenario = points_scenario(load_scenario("street", found))
     again, run = simulate_points(scenario, 1), read_run(path)
     assert scenario.camera == run.log.camera
     # From the end backwards, as the start is made smooth; in the frame of each flight's last camera.
@@ -92,18 +100,17 @@ def test_the_flight_is_flown_again(flown: tuple[Path, str]) -> None:
     assert len(again.frame) > 50 * len(again.t_s)
 
 
-def test_a_path_made_smaller_is_told(flown: tuple[Path, str], recwarn: pytest.WarningsRecorder) -> None:
+def test_a_path_made_smaller_is_told(flown: Flown, recwarn: pytest.WarningsRecorder) -> None:
     """In a hall of 12 m a drive of 150 m was flown at a walk, without a word."""
-    path, _ = flown
     with pytest.warns(UserWarning, match=r"flown at 0.11 of its size and speed"):
-        simulate_points(points_scenario(load_scenario("room-t265", like(path))), 1)
+        simulate_points(points_scenario(load_scenario("room-t265", flown.found)), 1)
     recwarn.clear()
-    simulate_points(points_scenario(load_scenario("street", like(path))), 1)
+    simulate_points(points_scenario(load_scenario("street", flown.found)), 1)
     assert not recwarn
 
 
-def test_a_run_without_tracks_is_refused(flown: tuple[Path, str], tmp_path: Path) -> None:
-    path, _ = flown
+def test_a_run_without_tracks_is_refused(flown: Flown, tmp_path: Path) -> None:
+    path = flown.path
     bare = tmp_path / "bare"
     bare.mkdir()
     for file in path.iterdir():
@@ -113,8 +120,8 @@ def test_a_run_without_tracks_is_refused(flown: tuple[Path, str], tmp_path: Path
         like(bare)
 
 
-def test_the_command_line(flown: tuple[Path, str], tmp_path: Path) -> None:
-    path, _ = flown
+def test_the_command_line(flown: Flown, tmp_path: Path) -> None:
+    path = flown.path
     words = ["simulate", "street", "--like", str(path), "--duration", "6", "-o", str(tmp_path / "sim.npz")]
     CliRunner().invoke(app, [*words, "--points"], catch_exceptions=False)
     assert (tmp_path / "sim.npz").is_file()
