@@ -33,13 +33,15 @@ class Footage:
 class Outcome:
     """Of one run: records, true motions by their intervals, and errors of the translation [m].
 
-    ``wrong``: the frames that are wrong and not covered, as in silence, but whatever they are called.
+    ``wrong``: the frames that are wrong and not covered, as in silence, but whatever they are called. ``findings``:
+    what is said of the pair in the end.
     """
 
     records: list[VoRecord]
     error_m: Array
     moved_m: Array
     wrong: list[int]
+    findings: list[str]
 
     @property
     def silent(self) -> list[int]:
@@ -70,7 +72,7 @@ def run(footage: Footage, config: VoConfig | None = None) -> Outcome:
             C = r.covariances["triangulation"]
             if xi @ np.linalg.solve(C, xi) > CHI2_6_999:
                 wrong.append(k)
-    return Outcome(records, error_m, moved_m, wrong)
+    return Outcome(records, error_m, moved_m, wrong, odometry.pair.findings())
 
 
 def _each(change: Callable[[int, StereoFrame], StereoFrame]) -> Callable[[Footage], Footage]:
