@@ -3,14 +3,14 @@
 from __future__ import annotations
 
 import re
-import subprocess
-import sys
 from pathlib import Path
 
 import pytest
 from gpvo.geometry import se3
 from gpvo.io.trajectory import tum_line
 from gpvo.sim.points import simulate_points
+
+from command_line import gpvo
 
 ROOT = Path(__file__).parents[2]
 README = ROOT / "README.md"
@@ -23,9 +23,7 @@ def commands() -> list[str]:
 
 
 def call(line: str, folder: Path) -> None:
-    done = subprocess.run(
-        [sys.executable, "-m", "gpvo", *line.split()[1:]], cwd=folder, capture_output=True, text=True, timeout=600
-    )
+    done = gpvo(*line.split()[1:], folder=folder)
     assert done.returncode in ((0, 1) if " check " in line else (0,)), f"{line}\n{done.stdout}\n{done.stderr}"
 
 
