@@ -6,6 +6,7 @@ as it has to: read, or refused by one line that names the file, in time and with
 
 from __future__ import annotations
 
+import gc
 import json
 import resource
 import shutil
@@ -284,6 +285,9 @@ def problems(seeds: Path, first: int, count: int, work: Path) -> Iterator[dict[s
     signal.signal(signal.SIGPROF, hang)
     most_mb = MEGABYTES + 300.0  # of Python and its libraries
     for number in range(first, first + count):
+        if number == first + len(TURNS):  # all that is loaded stays: it is searched for garbage no more
+            gc.collect()
+            gc.freeze()
         shutil.rmtree(work, ignore_errors=True)
         work.mkdir(parents=True)
         (work.parent / f"{work.name}.case").write_text(str(number))
