@@ -25,7 +25,6 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 from scipy.optimize import nnls
-from scipy.signal import lfilter
 
 from gpvo.twin.bundle import WHITEN, Observations, pose_jacobian, projection_jacobian
 from gpvo.twin.noise import Neighbours, Structure, draw_signs
@@ -162,7 +161,10 @@ def _drawn(kind: int, shape: tuple[int, ...], step_s: float, rng: np.random.Gene
     """Coefficients (F, ...) of unit variance, stationary in time."""
     x, keep = rng.standard_normal(shape), np.exp(-step_s / _TAU_S[kind]) if _TAU_S[kind] else 0.0
     x[1:] *= np.sqrt(1 - keep**2)
-    return np.asarray(lfilter([1.0], [1.0, -keep], x, axis=0))
+    if keep:  # by hand: loading scipy.signal takes as long as all else that twins need
+        for before, now in itertools.pairwise(x):
+            now += keep * before
+    return x
 
 
 def _basis(seen: Observations) -> Array:
