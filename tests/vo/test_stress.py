@@ -398,10 +398,12 @@ def test_only_a_motion_that_most_points_agree_with_may_call_the_others_noisy() -
         assert (free is None) == most
 
 
-def drive(count: int) -> stress.Footage:
-    """The first frames of KITTI raw 0001."""
+@cache
+def drive() -> stress.Footage:
+    """KITTI raw 0001."""
     source = open_source(Path(os.environ["GPVO_DATA"]) / "kitti_2011_09_26_0001")
-    frames = [f for f in source if isinstance(f, StereoFrame)][:count]
+    frames = [f for f in source if isinstance(f, StereoFrame)]
+    assert len(frames) == 108
     assert source.truth is not None
     T_world_cam, known = interpolate_truth(source.truth, np.array([f.t_ns for f in frames]))
     assert known.all()
@@ -449,7 +451,8 @@ def test_what_moves_with_the_camera() -> None:
 @pytest.mark.skipif("GPVO_DATA" not in os.environ, reason="GPVO_DATA names no folder of real data")
 def test_what_moves_with_the_camera_on_a_drive() -> None:
     """Thirty frames of KITTI raw 0001, about 10 m/s. A drive that begins with a bonnet over 40 % is taken for rest."""
-    found = held(drive(30))
+    whole = drive()
+    found = held(stress.Footage(whole.camera, whole.frames[:30], whole.T_world_cam[:30]))
     assert sum(len(found[fault].silent) for fault in SEEN_THROUGH) == 0
     assert sum(len(found[fault].wrong) for fault in SEEN_THROUGH if "40" not in fault) == 0
 
@@ -462,7 +465,7 @@ PARTS = ((0, 60), (20, 60), (45, 108))
 @pytest.mark.skipif("GPVO_DATA" not in os.environ, reason="GPVO_DATA names no folder of real data")
 def test_the_stress_list_on_a_drive() -> None:
     """Sixty frames of KITTI raw 0001, about 10 m/s: no fault is silent. Later stretches are tried with a late image."""
-    whole = drive(108)
+    whole = drive()
     parts = [stress.Footage(whole.camera, whole.frames[i], whole.T_world_cam[i]) for i in map(slice, *zip(*PARTS))]
     silent = {fault: stress.run(change(parts[0])).silent for fault, change in stress.FAULTS.items()}
     assert sum(map(len, silent.values())) == 0, silent
@@ -480,7 +483,7 @@ def test_wide_gaps_on_a_drive(stride: int, least: float) -> None:
 
     The rest are called lost or degraded, none is silent.
     """
-    whole = drive(108)
+    whole = drive()
     outcomes = [
         stress.run(stress.Footage(whole.camera, whole.frames[first::stride], whole.T_world_cam[first::stride]))
         for first in (0, stride // 2)
