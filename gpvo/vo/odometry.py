@@ -338,8 +338,9 @@ class StereoOdometry:
             otherwise = otherwise + lateness_covariance(self.pair.late, T_prev_cur)
         elif config.self_calibration:
             row_error, least_px = matches.row_error[motion.inliers], max(config.min_disparity_px, KNOWN_DEPTH_PX)
-            # Other doubts may come from the rig's own errors, which only learning ends.
-            sharp = not self.pair.unsharp
+            # An image at rest says nothing of depth, but with a wrong rig, what begins to move slowly fits one motion
+            # with what stays. Other doubts may come from the rig's own errors, which only learning ends.
+            moves = median_parallax_px(matches, motion.inliers) >= config.keyframe_parallax_px
             learnt = self.rig_error.update(
                 motion,
                 white,
@@ -347,7 +348,7 @@ class StereoOdometry:
                 least_px,
                 displaced=matches.displaced,
                 disputed=state.is_disputed,
-                sharp=sharp,
+                of_depth=moves and not self.pair.unsharp,
                 twists=twists,
             )
             otherwise = otherwise + learnt

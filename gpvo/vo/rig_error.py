@@ -204,13 +204,13 @@ class RigError:
         *,
         displaced: tuple[Array, Array] | None = None,
         disputed: bool = False,
-        sharp: bool = True,
+        of_depth: bool = True,
         twists: tuple[Array, Array] = (NO_TWIST, NO_TWIST),
     ) -> Array:
         """Learn from a motion over corrected measurements and its whitened residuals; its inliers have these row errors
-        (M,), which do not count where all points of the image are ``displaced``. Where the images are not equally
-        ``sharp``, it teaches rows alone: what disparities teach lasts. ``disputed``: another motion may be that of the
-        scene. ``twists``: the camera's velocity at its begin and at its end.
+        (M,), which do not count where all points of the image are ``displaced``. Where the images tell nothing
+        ``of_depth``, it teaches rows alone: what disparities teach lasts. ``disputed``: another motion may be that of
+        the scene. ``twists``: the camera's velocity at its begin and at its end.
 
         Returns
         -------
@@ -235,7 +235,7 @@ class RigError:
             self._undisputed = 0 if disputed else self._undisputed + 1
             sigma_px = motion.scale_px * np.sqrt(1.0 + motion.noise.persistent)
             near = motion.uvd_prev[:, 2] > min_disparity_px + _NEAR * sigma_px
-            if sharp and near.sum() >= 8:
+            if of_depth and near.sum() >= 8:
                 # The derivatives by the translation are in proportion to the disparity, and so to its error.
                 by_d = motion.scale_px**2 / motion.uvd_prev[:, 2] * (root / scale_px)
                 mistaken = (apply_whitener(white.W, q) * by_d for q in mistakable(motion, white))

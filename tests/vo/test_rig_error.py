@@ -176,6 +176,24 @@ def test_tracks_in_rows_that_jump_are_followed_again() -> None:
     assert all(r.status is Status.OK for r in records[40:])
 
 
+def test_a_lorry_that_sets_off_in_front_of_a_camera_at_rest_is_no_wrong_rig() -> None:
+    """If its disparities are 10 px off, what stays is far away, and one motion fits both."""
+    rng, camera = np.random.default_rng(3), StereoCamera(720.0, 720.0, 619.5, 187.5, 0.5, 1240, 376)
+    street = np.column_stack([rng.uniform(-12, 12, 200), rng.uniform(-4, 2, 200), rng.uniform(20, 45, 200)])
+    lorry = np.column_stack([rng.uniform(-2, 1.5, 90), rng.uniform(-1.3, 1, 90), rng.uniform(5, 11, 90)])
+    odometry, off_px = StereoOdometry(camera, VoConfig(max_acceleration_mps2=12.0)), []
+    for k in range(60):
+        ahead = 0.5 * 0.4 * max(0.1 * k - 2.0, 0.0) ** 2  # at 0.4 m/s^2
+        uvd = camera.project(np.concatenate([street, lorry + [0.0, 0.0, ahead]]))
+        born = 7 * (np.arange(len(uvd)) % 9)  # points are lost and found
+        track = np.arange(len(uvd)) + 1000 * ((k + born) // 12)
+        noise = rng.normal(0, 0.15, (2, len(track), 2))
+        right = uvd[:, :2] - uvd[:, 2:] * [1.0, 0.0]
+        odometry.step(TrackFrame(100_000_000 * k, track, uvd[:, :2] + noise[0], right + noise[1]))
+        off_px.append(np.abs(odometry.rig_error.errors(uvd)[0]).max())
+    assert max(off_px) < 0.5
+
+
 @pytest.mark.parametrize("sigma_px", [(0.12, 0.03), (0.03, 0.12)])
 def test_over_far_ground_with_edges_one_way_an_exact_rig_is_left_alone(sigma_px: tuple[float, float]) -> None:
     """Columns and rows of other noise than assumed, 30 m over a field with 0.6 m of relief: less than the noise shows.
