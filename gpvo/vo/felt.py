@@ -52,14 +52,16 @@ class _Span:
         off_mps, changed_mps = (np.linalg.norm(v) for v in (velocity_mps - self.velocity_mps, self.changed_mps))
         return bool(off_mps < 2.0 * self._sigma_mps() + 0.1 * changed_mps + 0.1)
 
-    def contradicts(self, velocity_mps: Array, share: float) -> bool:
-        """Whether a velocity (3,) has changed by far more or less than was felt, though a share of that may be wrong.
+    def contradicts(self, velocity_mps: Array, sigma_mps: float, share: float) -> bool:
+        """Whether a velocity (3,), to ``sigma_mps``, has changed by far more or less than was felt, though a share of
+        that may be wrong.
 
         An IMU whose axes are not as stated feels as much, but elsewhere: so only the amounts are compared.
         """
         seen_mps = np.linalg.norm(velocity_mps - (self.velocity_mps - self.changed_mps))
         felt_mps = np.linalg.norm(self.changed_mps)
-        return bool(abs(seen_mps - felt_mps) > 5.0 * self._sigma_mps() + share * felt_mps + _SPAN_MARGIN_MPS)
+        margin_mps = 5.0 * np.hypot(self._sigma_mps(), sigma_mps) + _SPAN_MARGIN_MPS
+        return bool(abs(seen_mps - felt_mps) > share * felt_mps + margin_mps)
 
     def _sigma_mps(self) -> float:
         return float(np.sqrt(self.variance @ [1.0, self.age_s**2]))
@@ -177,13 +179,15 @@ class Felt:
         self.P = self.P - np.outer(gain, self.P[0])
         self._compare()
 
-    def contradicted(self, twist: Array, lag_s: float) -> Array | None:
-        """(3,) the camera's velocity by the IMU alone where that contradicts a measured one (6,), else None."""
+    def contradicted(self, twist: Array, lag_s: float, sigma_mps: float = 0.0) -> Array | None:
+        """(3,) the camera's velocity by the IMU alone where that contradicts a measured one (6,), to ``sigma_mps``,
+        else None."""
         if self.span is None:
             return None
         velocity_mps = self.velocity_mps + twist[:3] - self.expected(lag_s)
         share = float(np.sqrt(self.span_wrong[0] / self.span_wrong[1]))
-        return self.span.velocity_mps - self._of_lever() if self.span.contradicts(velocity_mps, share) else None
+        is_contradicted = self.span.contradicts(velocity_mps, sigma_mps, share)
+        return self.span.velocity_mps - self._of_lever() if is_contradicted else None
 
     def _compare(self) -> None:
         """End a span that is confirmed or too long, and begin one."""

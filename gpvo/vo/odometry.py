@@ -253,7 +253,7 @@ class StereoOdometry:
         elif chosen.tells and not chosen.goes_on:
             state.leap(t_ns, T_ref_cur, self.config.max_acceleration_mps2)
         elif chosen.tells:
-            state.compare(t_ns, T_ref_cur)
+            state.compare(t_ns, T_ref_cur, motions[chosen.index].worst_translation_sigma_m)
         if chosen.plausible:
             unseen = state.follow(t_ns, T_ref_cur, shares[chosen.index], expected, goes_on=chosen.goes_on)
             chosen = replace(chosen, otherwise=chosen.otherwise + unseen)

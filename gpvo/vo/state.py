@@ -199,13 +199,14 @@ class State:
         self.leaps.step(t_ns, self._velocity(t_ns, T_ref_cur), last, self.t_twist_ns, reach_mps)
         self.refused = None
 
-    def compare(self, t_ns: int, T_ref_cur: Array) -> None:
-        """The motion from the reference goes on from the last velocity; but if that has slowly become another than the
-        IMU felt, it is in doubt as after a leap."""
+    def compare(self, t_ns: int, T_ref_cur: Array, sigma_m: float) -> None:
+        """The motion from the reference, to ``sigma_m``, goes on from the last velocity; but if that has slowly become
+        another than the IMU felt, it is in doubt as after a leap."""
         if self.felt is None or self.felt.span is None:
             return
         now = self._velocity(t_ns, T_ref_cur)
-        alone_mps = self.felt.contradicted(now, self._lag_s)
+        sigma_mps = sigma_m / max((t_ns - self.t_believed_ns) * 1e-9, 1e-6)
+        alone_mps = self.felt.contradicted(now, self._lag_s, sigma_mps)
         if alone_mps is None:
             return
         if self.leaps.before is None:

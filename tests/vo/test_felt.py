@@ -124,6 +124,12 @@ def test_an_image_that_moves_as_much_as_was_felt_is_not():
         assert felt.contradicted(-mps * way, 0.0) is None
 
 
+def test_an_image_too_noisy_to_tell_is_not():
+    felt, mps = set_off()
+    assert felt.contradicted(np.zeros(6), 0.0, 0.5 * SIGMA_MPS) is not None
+    assert felt.contradicted(np.zeros(6), 0.0, 0.5 * mps) is None
+
+
 def test_what_cannot_be_gravity_contradicts_nothing():
     for gravity_mps2 in (0.0, 1.0, 1.62):
         assert set_off(gravity_mps2)[0].contradicted(np.zeros(6), 0.0) is None
