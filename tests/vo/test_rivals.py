@@ -221,10 +221,10 @@ def test_traffic_is_never_called_ok_and_is_covered(tmp_path, seed, with_imu):
 
 def test_a_street_is_not_forgotten_while_a_car_may_hide_it(tmp_path):
     """A car alongside fills more and more of the image, until the street is no motion of its own."""
-    path = simulate_points("street-traffic", 200, duration_s=40.0).save(tmp_path / "a.npz")
+    path = simulate_points("street-traffic", 420, duration_s=40.0).save(tmp_path / "a.npz")
     source, config = open_source(path), make_config(max_acceleration_mps2=12.0, max_turn_radps2=20.0)
     source.imu = None
-    log = VoLog([step.record for step in islice(steps(source, config), 206)], source.camera)
+    log = VoLog([step.record for step in islice(steps(source, config), 315)], source.camera)
     wrong_m, ok, _ = wrong_and_ok(log, source.truth)
     assert ok.sum() > 100
     assert (wrong_m > 0.3).sum() > 40
