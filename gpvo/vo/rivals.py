@@ -40,14 +40,15 @@ _REGAINED = 0.3  # log odds, with each frame in which nothing speaks against the
 @dataclass(frozen=True)
 class Expected:
     """``T_prev_cur`` (4, 4) at the last velocity, off which a vehicle is by ``reach_m`` at most, and by ``sigma_m`` on
-    each axis; ``odds``: log odds that this velocity is that against the scene, and not against something that moves in
-    it. ``T_refused`` (4, 4), at a velocity that the vehicle could not have; ``T_left`` (4, 4), to ``left_reach_m``, at
-    one that was left though an IMU says that it lasts."""
+    each axis; ``C_turn`` (3, 3) covariance of its turn [rad^2]; ``odds``: log odds that this velocity is that against
+    the scene, and not against something that moves in it. ``T_refused`` (4, 4), at a velocity that the vehicle could
+    not have; ``T_left`` (4, 4), to ``left_reach_m``, at one that was left though an IMU says that it lasts."""
 
     T_prev_cur: Array
     reach_m: float
     sigma_m: float
     odds: float
+    C_turn: Array = field(default_factory=lambda: np.zeros((3, 3)))
     T_refused: Array | None = None
     felt: bool = False  # an IMU says so
     T_left: Array | None = None
@@ -213,6 +214,8 @@ def choose(
     d = np.stack([se3.log(se3.inverse(candidates[best]) @ T) for T in candidates])
     otherwise = np.einsum("i,ij,ik->jk", share, d, d)
     otherwise[:3, :3] += share @ np.square(np.where(np.isfinite(sigma_m), sigma_m, 0.0)) * np.eye(3)
+    if len(candidates) > len(motions) and expected is not None:
+        otherwise[3:, 3:] += share[-1] * expected.C_turn
     return Choice(best, otherwise, plausible, plausible and bool(tells[best]), min(odds, _SUREST), on)
 
 

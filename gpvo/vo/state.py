@@ -170,7 +170,8 @@ class State:
         reach_mps = max_acceleration_mps2 * age_s
         sigma_m = reach_mps * step_s / _SIGMAS_WITHIN_REACH
         T_same = self.T_ref_believed @ se3.exp(self.twist * step_s)
-        expected = Expected(T_same, reach_mps * step_s + jitter_m, sigma_m, self.odds, T_refused)
+        C_turn = step_s**2 * self.standing.unseen(self.twist)[3:, 3:]
+        expected = Expected(T_same, reach_mps * step_s + jitter_m, sigma_m, self.odds, C_turn, T_refused)
         if self.leaps.before is not None and self.leaps.contradicted:
             left_reach_mps = _SIGMAS_WITHIN_REACH * self._sigma_before_mps(t_ns, max_acceleration_mps2)
             if self.leaps.differs(self.twist, left_reach_mps):
@@ -250,7 +251,9 @@ class State:
         dt_s = (t_ns - self.t_ref_ns) * 1e-9
         d = se3.log(se3.inverse(T_ref_cur) @ se3.exp(before * dt_s))
         sigma_m = self._sigma_before_mps(t_ns, max_acceleration_mps2) * dt_s
-        return 0.5 * (np.outer(d, d) + np.diag([sigma_m**2] * 3 + [0.0] * 3))
+        C = np.outer(d, d) + np.diag([sigma_m**2] * 3 + [0.0] * 3)
+        C[3:, 3:] += dt_s**2 * self.standing.unseen(before)[3:, 3:]
+        return 0.5 * C
 
     def _sigma_before_mps(self, t_ns: int, max_acceleration_mps2: float) -> float:
         """Standard deviation, on each axis, of the velocity before the leap, carried on to ``t_ns``."""

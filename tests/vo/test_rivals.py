@@ -58,6 +58,18 @@ def test_a_second_bad_motion_is_not_believed_because_the_first_was():
         odds = choice.odds
 
 
+def test_a_velocity_that_is_not_seen_is_known_no_better_in_its_turn():
+    """Beside a lorry that fills the image, a vehicle may turn unseen."""
+    turn = np.diag([1e-6, 4e-4, 1e-6])
+    choice = choose([moving(0.0)], (1,), replace(expecting(2.0, 3.0), C_turn=turn))
+    assert choice.otherwise[4, 4] > 0.9 * turn[1, 1]
+    state, twist = State.begin(0, 100, None), np.array([0.0, 0.0, 5.0, 0.0, 0.1, 0.0])
+    state.leaps.step(8 * 10**9, twist, 0.0 * twist, 79 * 10**8, 1.0)
+    otherwise = state.otherwise(81 * 10**8, np.eye(4), 12.0)
+    assert otherwise is not None
+    assert otherwise[4, 4] > 0.5 * (0.5 * 8.1) ** 2 * 0.9  # as one of which no turn is known may turn
+
+
 def test_a_leap_is_in_doubt_until_one_leads_back_or_it_has_lasted_as_long():
     """From 15 m/s on to a lorry's 0.5 m/s after 8 s, and off it again by a car of 12 m/s^2."""
     seconds, before, lorry = 10**9, np.array([0, 0, 15.0, 0, 0, 0]), np.array([0, 0, 0.5, 0, 0, 0])
