@@ -216,16 +216,16 @@ def _read_camera_info(path: Path) -> CameraInfo:
 def rig_from_camera_info(left: CameraInfo, right: CameraInfo, *, rectified: bool, where: object = None) -> StereoRig:
     """The rig of two CameraInfo messages; ``rectified`` says that the images already are.
 
-    The right camera's ``P[0, 3]`` is ``-fx' B``. For raw images the rectifying rotations ``R`` of both give their
-    relative orientation: ``R_right_left = R_right^T R_left``. Raises CalibrationError where the cameras are
-    uncalibrated (``K[0] == 0``), the baseline is absent or the rig impossible.
+    The right camera's ``P[0, 3]`` is ``-fx' B``, and ``P[1, 3]`` that of one below the left one. For raw images the
+    rectifying rotations ``R`` of both give their relative orientation: ``R_right_left = R_right^T R_left``. Raises
+    CalibrationError where the cameras are uncalibrated (``K[0] == 0``), the baseline is absent or the rig impossible.
     """
     for name, info in (("left", left), ("right", right)):
-        if info.K[0, 0] == 0 or info.P[0, 0] == 0:
+        if 0 in (info.K[0, 0], info.P[0, 0], info.P[1, 1]):
             cure = "put a Kalibr camchain.yaml beside the bag"
             raise CalibrationError(f"the {name} CameraInfo is uncalibrated (K[0] or P[0] is 0)", where=where, cure=cure)
-    baseline = left.P[0, 3] / left.P[0, 0] - right.P[0, 3] / right.P[0, 0]
-    place, text = np.array([-baseline, 0.0, 0.0]), None if where is None else str(where)
+    places = [np.array([c.P[0, 3] / c.P[0, 0], c.P[1, 3] / c.P[1, 1], 0.0]) for c in (left, right)]
+    place, text = places[1] - places[0], None if where is None else str(where)
     if rectified:
         lenses = [PinholeRadtan(*_of_matrix(c.P), c.width, c.height) for c in (left, right)]
         return StereoRig(lenses[0], lenses[1], se3.from_rt(np.eye(3), place), where=text)

@@ -35,7 +35,8 @@ class Rectifier:
     hfov_deg : horizontal field of view of the virtual camera [deg]; by default the focal length is that of the
         lens, so that pixels keep their density at the centre, and the size that of the image, for a fisheye at most
         114 degrees wide and high.
-    size : (width, height) of the virtual images [px]; by default that of the raw ones.
+    size : (width, height) of the virtual images [px]; by default that of the raw left ones, turned with them where one
+        camera sits above the other.
 
     Attributes
     ----------
@@ -82,8 +83,12 @@ class Rectifier:
 
     def _virtual_camera(self, hfov_deg: float | None, size: tuple[int, int] | None) -> StereoCamera:
         lenses = (self.rig.left, self.rig.right)
-        f = float(np.mean([[c.fx_px, c.fy_px] for c in lenses]))
-        width, height = size if size is not None else (self.rig.left.width, self.rig.left.height)
+        left = self.rig.left
+        f = float(
+            np.mean([[c.fx_px, c.fy_px] for c in lenses] * np.array([[1.0], [left.width / self.rig.right.width]]))
+        )
+        width, height = (left.height, left.width) if self.rig.is_upright else (left.width, left.height)
+        width, height = size or (width, height)
         if min(width, height) < 16 or not is_plausible((width, height)):
             raise CalibrationError(f"rectified size {width}x{height} is not possible", where=self.rig.where)
         if hfov_deg is not None:
@@ -92,7 +97,7 @@ class Rectifier:
                 text = f"a pinhole image of {hfov_deg:g} degrees is not possible"
                 raise CalibrationError(text, where=self.rig.where, cure=cure)
             f = 0.5 * width / np.tan(0.5 * np.deg2rad(hfov_deg))
-        elif size is None and isinstance(self.rig.left, KannalaBrandt):
+        elif size is None and isinstance(left, KannalaBrandt):
             limit = 2 * int(f * np.tan(MAX_DEFAULT_HALF_ANGLE_RAD))
             width, height = min(width, limit), min(height, limit)
         cx, cy = self._principal_point(f, width, height)

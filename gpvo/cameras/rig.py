@@ -43,8 +43,8 @@ class StereoRig:
     where: str | None = None
 
     def __post_init__(self) -> None:
-        """Raise CalibrationError for a rig that cannot exist: baseline absent, too long, pointing the wrong way or not
-        sideways; cameras turned apart; lenses that do not belong together; intrinsics outside the image."""
+        """Raise CalibrationError for a rig that cannot exist: baseline absent, too long, pointing the wrong way or
+        along the view; cameras turned apart; lenses that do not belong together; intrinsics outside the image."""
         for name, lens, mask in (("left", self.left, self.mask_left), ("right", self.right, self.mask_right)):
             _check_lens(lens, name, self.where)
             if mask is not None and mask.shape != (lens.height, lens.width):
@@ -52,9 +52,11 @@ class StereoRig:
                 raise CalibrationError(text, where=self.where)
         check_pose(self.T_right_left, "T_right_left", self.where)
         _check_baseline(self)
-        a, b = self.left.fx_px, self.right.fx_px
+        # Over their widths: sensors of one view may differ in resolution.
+        a, b = self.left.fx_px / self.left.width, self.right.fx_px / self.right.width
         if max(a, b) / min(a, b) > MAX_FOCAL_RATIO:
-            text = f"focal lengths of {a:.1f} px and {b:.1f} px do not make a stereo pair"
+            focal = f"{self.left.fx_px:.1f} px and {self.right.fx_px:.1f} px"
+            text = f"focal lengths of {focal} do not make a stereo pair"
             cure = "are these two cameras of one rig, calibrated at one resolution?"
             raise CalibrationError(text, where=self.where, cure=cure)
 
@@ -62,6 +64,12 @@ class StereoRig:
     def baseline_m(self) -> float:
         """Distance of the optical centres [m]."""
         return float(np.linalg.norm(self.T_right_left[:3, 3]))
+
+    @property
+    def is_upright(self) -> bool:
+        """Whether one camera sits above the other, in image axes, so that rectified images lie on their side."""
+        x, y, _ = mean_view(self.T_right_left)[1]
+        return bool(abs(y) > abs(x))
 
     @property
     def is_rectified(self) -> bool:
@@ -167,10 +175,9 @@ def _check_baseline(rig: StereoRig) -> None:
     if x < -0.7:
         text = f"the right camera sits {length * 1e3:.0f} mm to the left of the left one: left and right are swapped"
         raise CalibrationError(text, where=where, cure="swap the two cameras, or invert the transform between them")
-    if x < 0.7:
-        axis = "above or below" if abs(y) >= abs(z) else "in front of or behind"
-        text = f"the right camera sits {axis} the left one, direction ({x:.2f}, {y:.2f}, {z:.2f})"
-        cure = "the pair must sit side by side in image axes; check the chained transforms"
+    if np.hypot(x, y) < 0.7:
+        text = f"the right camera sits in front of or behind the left one, direction ({x:.2f}, {y:.2f}, {z:.2f})"
+        cure = "the pair must sit side by side, or one above the other, in image axes; check the chained transforms"
         raise CalibrationError(text, where=where, cure=cure)
 
 

@@ -129,6 +129,8 @@ class ImageSource(ABC):
         self.known = SourceReport() if known is None else known
         if rig.baseline_m > LONG_BASELINE_M:
             self.known.note(f"baseline {rig.baseline_m:.2f} m: are the translations in metres?")
+        if rig.is_upright:
+            self.known.note("one camera sits above the other: images are turned by a quarter, so that rows are aligned")
         self.report = self._fresh_report()
         R_rect_left = self.rectifier.R_rect_left.tolist()
         self.calibration: dict[str, Any] | None = {**rig.describe(), "R_rect_left": R_rect_left}

@@ -242,6 +242,18 @@ def test_camera_info_gives_back_the_rig():
         rig_from_camera_info(blank, right, rectified=False)
 
 
+def test_camera_info_of_a_pair_one_above_the_other():
+    """OpenCV and ROS write their baseline into the second row of the projection."""
+    K = np.array([[400.0, 0, 320], [0, 410, 240], [0, 0, 1]])
+    P = np.column_stack([K, np.zeros(3)])
+    upper = CameraInfo(640, 480, "plumb_bob", np.zeros(5), K, np.eye(3), P)
+    lower = replace(upper, P=P + np.outer([0, -410 * 0.12, 0], [0, 0, 0, 1]))
+    for rectified in (True, False):
+        rig = rig_from_camera_info(upper, lower, rectified=rectified)
+        np.testing.assert_allclose(rig.T_right_left[:3, 3], [0, -0.12, 0], atol=1e-12)
+        assert rig.is_upright
+
+
 WINDOW = (64, 40, 512, 384)
 
 

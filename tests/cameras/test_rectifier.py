@@ -21,6 +21,12 @@ RADTAN = StereoRig(
     PinholeRadtan(457.587, 456.134, 379.999, 255.238, 752, 480, (-0.28368365, 0.07451284, -0.00010473, -3.555e-05)),
     se3.exp(np.array([-0.110, 0.0004, -0.0008, 0.007, -0.0023, -0.014])),
 )
+# One camera below the other, and of another resolution.
+UPRIGHT = StereoRig(
+    RADTAN.left,
+    PinholeRadtan(915.2, 912.3, 760.0, 510.5, 1504, 960),
+    se3.exp(np.array([0.004, -0.12, 0.002, 0.01, -0.02, 0.015])),
+)
 
 
 def _project_to_rectified(rectifier: Rectifier, uv: np.ndarray, right: bool) -> np.ndarray:
@@ -30,7 +36,7 @@ def _project_to_rectified(rectifier: Rectifier, uv: np.ndarray, right: bool) -> 
     return ray[:, :2] / ray[:, 2:] * (c.fx_px, c.fy_px) + (c.cx_px, c.cy_px)
 
 
-@pytest.mark.parametrize("rig", [FISHEYE, RADTAN], ids=["fisheye", "radtan"])
+@pytest.mark.parametrize("rig", [FISHEYE, RADTAN, UPRIGHT], ids=["fisheye", "radtan", "upright"])
 @pytest.mark.parametrize("options", [{}, {"hfov_deg": 80.0}, {"hfov_deg": 90.0, "size": (320, 240)}])
 def test_points_land_where_the_virtual_camera_says(rig, options):
     rectifier = Rectifier(rig, **options)
@@ -74,6 +80,18 @@ def test_remapped_images_agree_with_the_geometry(rig):
         # Half a grey value of rounding twice; a shift of half a pixel would cost more.
         assert error.mean() < 0.6
         assert error.max() < 3
+
+
+def test_a_pair_one_above_the_other_lies_on_its_side():
+    """All of both pictures is seen, at the left one's density, whichever camera is the upper one."""
+    upper = StereoRig(UPRIGHT.left, UPRIGHT.left, se3.inverse(UPRIGHT.T_right_left))
+    for rig in (UPRIGHT, upper):
+        rectifier = Rectifier(rig)
+        c = rectifier.camera
+        assert (c.width, c.height) == (480, 752)
+        assert c.fx_px == pytest.approx(457.5, abs=1)
+        assert rectifier.mask is None or rectifier.mask.mean() > 0.9
+        assert np.abs(rectifier.R_rect_left[2] - [0, 0, 1]).max() < 0.05
 
 
 def test_defaults_keep_the_pixel_density():

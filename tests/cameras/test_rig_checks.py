@@ -23,7 +23,7 @@ def _T(x, y=0.0, z=0.0, turn=(0.0, 0.0, 0.0)):
         (_T(0.0), "both cameras in one place"),
         (_T(-1e-5), "both cameras in one place"),
         (_T(-110.0), "more than 10 m"),
-        (_T(-0.01, 0.11), "above or below"),
+        (_T(-0.01, 0.05, 0.11), "in front of or behind"),
         (_T(-0.01, 0.0, 0.11), "in front of or behind"),
         (_T(-0.11, turn=(0, 0.8, 0)), "rotated by 46 degrees to each other"),
         (np.full((4, 4), np.nan), "not finite"),
@@ -49,6 +49,12 @@ def test_impossible_geometry(T, reason):
 def test_impossible_lens(lens, reason):
     with pytest.raises(CalibrationError, match=reason):
         StereoRig(LENS, lens, _T(-0.1))
+
+
+def test_lenses_are_compared_by_what_they_see():
+    """Sensors of one view may differ in resolution."""
+    fine = PinholeRadtan(800.0, 800.0, 640.0, 480.0, 1280, 960)
+    assert StereoRig(LENS, fine, _T(-0.1)).baseline_m == pytest.approx(0.1)
 
 
 def test_good_rigs_pass():
