@@ -184,7 +184,7 @@ class PairWatch:
         self.late = self._lateness(right)
         if self.late:
             self._seen["late"] += 1
-            doubts.append(f"the {'right' if self.late > 0 else 'left'} image is {abs(self.late):.1f} frames late")
+            doubts.append(f"the {'right' if self.late > 0 else 'left'} image is {abs(self.late):.1f} frames older")
         lost = right.sought - right.found
         cause = "swapped" if right.behind > 0.5 * lost else "rows" if right.off_row > 0.5 * lost else "few"
         # A point that is not found may be in the dark; one found where it cannot be says that the images are no pair.
@@ -220,7 +220,10 @@ class PairWatch:
         if n < 20 or mm < n:  # rows must move by a pixel
             return self.late
         small = ee < _RIG_PX**2 * n
-        if em**2 < 0.25 * ee * mm:  # motion must explain a quarter of the error's variance
+        # Noise of the left row is in both, with opposite signs, and that of the right one in the error and in the mean
+        # row's motion alike: a delay shows against both motions, noise against one of them.
+        mean_e, mean_m = em + ee / 2, mm + em + ee / 4
+        if em**2 < 0.25 * ee * mm or mean_e**2 < 0.25 * ee * mean_m:  # motion must explain a quarter of its variance
             return 0.0 if small else self.late
         if small and not self.late:  # so may a wrong rig's; but an image that was late is not in time as it slows down
             return 0.0
