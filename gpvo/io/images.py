@@ -38,6 +38,10 @@ _MAX_DISTANCE_BITS = 40
 _MIN_MATCHES = 25
 _MIN_RATIO = 5.0
 _FRAMES = 5
+# A mosaic of a colour filter repeats every two pixels along both axes.
+_TILE_PX = 32
+_ALTERNATES = 0.25
+_MOSAIC = "the images are the raw mosaic of a colour filter: smoothed over it; demosaic them for sharper ones"
 
 SWAPPED = "left and right images are swapped: matched points have negative disparity"
 """What is said of a sequence that an OrderCheck refuses."""
@@ -160,10 +164,15 @@ class ImageSource(ABC):
         return replace(self.known, notes=list(self.known.notes))
 
     def _frames(self, report: SourceReport) -> Iterator[StereoFrame]:
-        order = OrderCheck()
+        order, mosaic = OrderCheck(), False
         for raw in in_order(self._readable(report), report, self.usual_interval_ns):
             report.frames += 1
-            frame = StereoFrame(raw.t_ns, *self.rectifier.apply(raw.left, raw.right))
+            left, right = raw.left, raw.right
+            mosaic = mosaic or (report.frames <= _FRAMES and is_mosaic(left))
+            if mosaic:
+                report.note(_MOSAIC)
+                left, right = smooth_mosaic(left), smooth_mosaic(right)
+            frame = StereoFrame(raw.t_ns, *self.rectifier.apply(left, right))
             if order.is_swapped(frame):
                 raise SourceError(SWAPPED, where=self.path, cure="exchange the two image folders or topics")
             yield frame
@@ -251,6 +260,29 @@ class OrderCheck:
             self._unclear = 0 if sign > 0 else self._unclear - 1
             self._swapped += sign < 0
         return self._swapped >= 2
+
+
+def is_mosaic(image: Image8) -> bool:
+    """Whether grey values (H, W) alternate from pixel to pixel along rows and columns in most parts of the image, as in
+    the raw mosaic of a colour filter: green lies on every second pixel. No texture, noise or interlacing does so.
+
+    That component is what second differences along both axes have in common with a chequerboard.
+    """
+    h, w = (n // _TILE_PX * _TILE_PX for n in image.shape)
+    if min(h, w) == 0:
+        return False
+    second = np.array([1.0, -2.0, 1.0], np.float32) / 4
+    rough = cv2.sepFilter2D(image[:h, :w], cv2.CV_32F, second, second)
+    rough[::2, 1::2] *= -1
+    rough[1::2, ::2] *= -1
+    tiles = cv2.resize(rough, (w // _TILE_PX, h // _TILE_PX), interpolation=cv2.INTER_AREA)
+    return bool(np.median(np.abs(tiles)) > _ALTERNATES * max(cv2.norm(rough) / np.sqrt(rough.size), 1.0))
+
+
+def smooth_mosaic(image: Image8) -> Image8:
+    """The image (H, W) without what repeats every two pixels, whatever the pattern of the filter."""
+    mean = np.array([1.0, 2.0, 1.0], np.float32) / 4
+    return np.asarray(cv2.sepFilter2D(image, -1, mean, mean), np.uint8)
 
 
 def disparity_sign(frame: StereoFrame) -> int:

@@ -19,6 +19,8 @@ from numpy.typing import NDArray
 from gpvo.errors import SourceError, counted, plugins, printable
 from gpvo.types import ImuLog, Mounting, StereoCamera, StereoFrame, TrackFrame, TruthLog
 
+_EXTREME = 0.002  # share of a picture's samples at either end that tell nothing of its range
+
 
 @dataclass
 class SourceReport:
@@ -58,6 +60,10 @@ class Depth:
     """Depth of 16-bit images: ``bits``, the lower ones of the 16 that samples fill, and ``most``, the largest sample so
     far. ``refused``: what is wrong with images whose samples are of another kind, empty where there were none.
 
+    ``span``: the samples that become 0 and 255, where a picture stands on an offset that is larger than its own range,
+    as those of thermal cameras do, of which 256 steps of all bits would leave almost nothing; else None. It is twice as
+    wide as the first such picture, and widens for later ones, so that grey values of a scene rarely change.
+
     Raises SourceError where ``bits`` is not from 8 to 16.
     """
 
@@ -65,22 +71,45 @@ class Depth:
         if not 8 <= bits <= 16:
             raise SourceError(f"images of {bits} bits are not possible", cure="give 8 to 16")
         self.bits, self.most, self.refused = bits, 0, ""
+        self.span: tuple[float, float] | None = None
 
     def to8(self, samples: NDArray[np.uint16]) -> NDArray[np.uint8]:
-        """Samples of any shape in 8 bit."""
+        """Samples (H, W) in 8 bit."""
         self.most = max(self.most, int(samples.max(initial=0)))
+        self._widen(samples)
+        if self.span is not None:
+            low, high = self.span
+            grey = (samples.astype(np.float32) - low) * (255 / (high - low))
+            return np.asarray(np.clip(np.rint(grey), 0, 255), dtype=np.uint8)
         # Rounded, not cut: cutting would darken by half a step.
         shift = self.bits - 8
         half = (1 << shift) >> 1
         return np.asarray(np.minimum((samples.astype(np.uint32) + half) >> shift, 255), dtype=np.uint8)
 
+    def _widen(self, samples: NDArray[np.uint16]) -> None:
+        """Let the span hold the picture, but for its most extreme samples and blank ones, of a border."""
+        shown = samples[:: 1 + samples.shape[0] // 128, :: 1 + samples.shape[1] // 128]
+        shown = np.sort(shown[shown > 0])
+        if len(shown) == 0:
+            return
+        low, high = (float(shown[int(share * (len(shown) - 1))]) for share in (_EXTREME, 1 - _EXTREME))
+        if self.span is None and not 0 < high - low < min(low, (1 << self.bits) / 8):
+            return
+        if self.span is None or low < self.span[0] or high > self.span[1]:
+            margin = max(high - low, 256 - (high - low)) / 2  # of half its range, and no finer than a sample's step
+            least, most = self.span or (low, high)
+            self.span = min(least, low - margin), max(most, high + margin)
+
     def doubt(self) -> str:
-        """What the samples say against ``bits``; empty for nothing."""
+        """What the samples say against ``bits``, or how they were spread; empty for nothing."""
         if self.refused:
             return self.refused
         if self.most >> self.bits:
             held = f"samples reach {self.most}, more than {self.bits} bits hold"
             return f"{held}: brighter ones are clipped (--bits {self.most.bit_length()})"
+        if self.span is not None:
+            low, high = (min(max(round(s), 0), 65535) for s in self.span)
+            return f"the samples of 16-bit images keep to a small range: {low} to {high} are spread over 8 bits"
         likely = next(n for n in (8, 10, 12, 16) if self.most < 1 << n)
         if self.most and likely < self.bits == 16:
             return f"the samples of 16-bit images reach only {self.most}: are these {likely} bits (--bits {likely})?"

@@ -16,6 +16,7 @@ from gpvo.cameras.rectify import rectifying_rotations
 from gpvo.errors import CalibrationError, GpvoError, SourceError
 from gpvo.geometry import se3
 from gpvo.io import guess, open_source
+from gpvo.io.images import is_mosaic, smooth_mosaic
 from gpvo.io.source import Source, source_kinds
 from gpvo.vo.rig_findings import camchain
 
@@ -456,6 +457,52 @@ def test_depth_that_does_not_fit(tmp_path, bits, most, doubt):
         notes = source.report.notes
         assert len(notes) == 1 if doubt else not notes
         assert doubt is None or re.search(doubt, notes[0])
+
+
+@pytest.mark.parametrize("bits", [14, 16])
+def test_a_thermal_picture_on_an_offset_uses_eight_bits(tmp_path, bits):
+    """Raw counts of 14 bits that differ by 300 become grey values that differ by half of all; brighter and darker
+    pictures, and the black border of a rectified one, do not change the first. A scene in the dark keeps its light."""
+    path = seq.write_folder(tmp_path / "s", 4)
+    ramp = np.tile(np.linspace(7280, 7580, seq.WIDTH), (seq.HEIGHT, 1))
+    ramp[:5] = 0
+    for side in ("left", "right"):
+        for k, file in enumerate(sorted((path / side).iterdir())):
+            shown = ramp + (0, 60, -60, 1500)[k]
+            seq.write_image(file, np.where(ramp > 0, shown, 0).astype(np.uint16))
+    source = open_source(path, bits=bits)
+    rows = [frame.left[20].astype(float) for frame in source]
+    assert [round(row[-4] - row[3]) for row in rows[:3]] == [pytest.approx(114, abs=3)] * 3
+    assert rows[1].mean() - rows[0].mean() == pytest.approx(25, abs=2)
+    assert rows[0].mean() == pytest.approx(127, abs=2)
+    assert 20 < rows[3][-4] - rows[3][3] < 60
+    assert rows[3].max() < 255
+    assert [n for n in source.report.notes if "keep to a small range" in n]
+    dark = np.tile(np.linspace(0, 300, seq.WIDTH), (seq.HEIGHT, 1)).astype(np.uint16)
+    for file in path.rglob("*.png"):
+        seq.write_image(file, dark)
+    assert max(int(frame.left.max()) for frame in open_source(path, bits=12)) <= 20
+
+
+def test_a_raw_colour_mosaic_is_smoothed(tmp_path):
+    """Whatever its pattern; texture, noise and interlaced rows are none."""
+    rng = np.random.default_rng(0)
+    h, w = 96, 128
+    scene = cv2.resize(rng.uniform(40, 200, (h // 4, w // 4)), (w, h), interpolation=cv2.INTER_CUBIC)
+    noise = rng.normal(0, 3, (h, w))
+    for red, blue, y, x in ((0.4, 0.6, 0, 0), (0.5, 0.8, 0, 1), (1.4, 1.2, 1, 0)):
+        gain = np.ones((h, w))
+        gain[y::2, x::2], gain[1 - y :: 2, 1 - x :: 2] = red, blue
+        mosaic = np.clip(scene * gain * 0.7 + noise, 0, 255).astype(np.uint8)
+        assert is_mosaic(mosaic)
+        smooth = smooth_mosaic(mosaic)
+        assert not is_mosaic(smooth)
+        assert smooth[4:-4, 4:-4].mean() == pytest.approx(mosaic[4:-4, 4:-4].mean(), abs=0.6)
+        error = smooth - scene * 0.7 * (2 + red + blue) / 4
+        assert error[8:-8, 8:-8].std() < 6
+    woven = np.where(np.arange(h)[:, None] % 2, scene, np.roll(scene, 5, axis=1))
+    for image in (scene, scene + 8 * noise, woven, rng.uniform(0, 255, (h, w)), np.full((h, w), 90), scene[:20, :20]):
+        assert not is_mosaic(np.clip(image, 0, 255).astype(np.uint8))
 
 
 def test_user_mask_reaches_the_source(tmp_path):
