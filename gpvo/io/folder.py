@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+from collections.abc import Iterator
 from itertools import pairwise
 from math import gcd
 from pathlib import Path
@@ -34,7 +35,8 @@ T = TypeVar("T")
 
 
 class FolderSource(FileSource):
-    """Pairs in two folders, or in one with their side at either end of their names; sides are those of :data:`SIDES`.
+    """Pairs in two folders, or in one; these, or the images, have their side at either end of their names; sides are
+    those of :data:`SIDES`.
 
     Stamps are the names in nanoseconds (or decimal seconds), else the lines of ``times.txt`` (seconds) in the order
     of the names, else ``rate_hz`` makes them from the number in the name, if it counts the images; those of a pair may
@@ -73,7 +75,7 @@ class FolderSource(FileSource):
     @classmethod
     def recognises(cls, path: Path) -> bool:
         """A folder with a pair of image folders or left and right images."""
-        return path.is_dir() and (_pair_of(_folders(path)) is not None or all(_side_files(path)))
+        return path.is_dir() and (_folder_pair(path) is not None or all(_side_files(path)))
 
 
 def _is_image(path: Path) -> bool:
@@ -97,28 +99,49 @@ def _pair_of(named: dict[str, T]) -> tuple[T, T] | None:
     return next(((named[a], named[b]) for a, b in _PAIRS if a in named and b in named), None)
 
 
-def _folders(path: Path) -> dict[str, Path]:
-    return {f.name.lower().removeprefix("image_"): f for f in sorted(path.iterdir()) if f.is_dir()}
+def _folder_pair(path: Path) -> tuple[Path, Path] | None:
+    """The folders of both cameras: named by their sides, or the only two with images whose names have a side at one end
+    and are else the same, such as stereo_left and stereo_right."""
+    folders = [f for f in sorted(path.iterdir()) if f.is_dir()]
+    if (pair := _pair_of({f.name.lower().removeprefix("image_"): f for f in folders})) is not None:
+        return pair
+    for pattern in _NAMES:
+        if (sides := _pair_of(_by_side([f for f in folders if any(_images_in(f))], pattern))) is not None:
+            common = sides[0].keys() & sides[1].keys()
+            if len(common) == 1:
+                stem = common.pop()
+                return sides[0][stem], sides[1][stem]
+    return None
+
+
+def _images_in(folder: Path) -> Iterator[Path]:
+    """Images in a folder of one camera, or in ``data`` below it."""
+    inside = folder / "data" if (folder / "data").is_dir() else folder
+    return (f for f in inside.iterdir() if _is_image(f))
+
+
+def _by_side(paths: list[Path], pattern: re.Pattern[str]) -> dict[str, dict[str, Path]]:
+    """Those with a side in their names: by side in small letters, then by what else the name holds."""
+    named: dict[str, dict[str, Path]] = {}
+    for path in paths:
+        if match := pattern.fullmatch(path.stem):
+            named.setdefault(match["side"].lower(), {})[match["stem"]] = path
+    return named
 
 
 def _find_images(path: Path) -> tuple[dict[str, Path], dict[str, Path]]:
     """Images of both cameras, keyed by what their names have in common."""
-    if (pair := _pair_of(_folders(path))) is None:
+    if (pair := _folder_pair(path)) is None:
         return _side_files(path)
-    sides = [s / "data" if (s / "data").is_dir() else s for s in pair]
     # Without a side at their ends: 000012_left and 000012 alike.
-    left, right = ({_END.sub("", f.stem): f for f in sorted(s.iterdir()) if _is_image(f)} for s in sides)
+    left, right = ({_END.sub("", f.stem): f for f in sorted(_images_in(side))} for side in pair)
     return left, right
 
 
 def _side_files(path: Path) -> tuple[dict[str, Path], dict[str, Path]]:
     files = [f for f in sorted(path.iterdir()) if _is_image(f)]
     for pattern in _NAMES:
-        named: dict[str, dict[str, Path]] = {}
-        for file in files:
-            if match := pattern.fullmatch(file.stem):
-                named.setdefault(match["side"].lower(), {})[match["stem"]] = file
-        if (pair := _pair_of(named)) is not None:
+        if (pair := _pair_of(_by_side(files, pattern))) is not None:
             return pair
     return {}, {}
 

@@ -188,8 +188,8 @@ def guess(path: str | Path) -> str:
         where=p,
         cure="known are EuRoC/ASL (mav0/), KITTI (calib.txt, image_0/, or image_00/data/), ROS bags (.bag, .db3, .mcap,"
         " or a folder of those of one recording), image pairs with a camchain.yaml (left/ right/, cam0/ cam1/, infra1/"
-        " infra2/, or left, right at one end of the names), and tracks (.npz); name one with --source; poses alone are"
-        " for 'gpvo import'",
+        " infra2/, or left, right at one end of the names of two folders or of images), and tracks (.npz); name one"
+        " with --source; poses alone are for 'gpvo import'",
     )
 
 

@@ -248,11 +248,24 @@ def test_vicon_marker_and_leica(tmp_path):
         ("cam_0", "cam_1"),
         ("camera0", "camera1"),
         ("camera1", "camera2"),
+        ("stereo_left", "stereo_right"),
+        ("left_images/data", "right_images/data"),
+        ("images-cam0", "images-cam1"),
     ],
 )
 def test_folder_names(tmp_path, left, right):
-    source = open_source(seq.write_folder(tmp_path / "s", left=left, right=right))
-    assert [k for _, k in seq.frames_of(source)] == list(range(12))
+    path = seq.write_folder(tmp_path / "s", left=left, right=right)
+    for empty in ("log_left", "log_right", "other"):
+        (path / empty).mkdir()
+    assert guess(path) == "folder"
+    assert [k for _, k in seq.frames_of(open_source(path))] == list(range(12))
+
+
+def test_of_several_pairs_of_folders_none_is_guessed(tmp_path):
+    for what in ("colour", "depth"):
+        path = seq.write_folder(tmp_path / "s", left=f"{what}_left", right=f"{what}_right")
+    with pytest.raises(SourceError, match="not recognised"):
+        guess(path)
 
 
 @pytest.mark.parametrize(
