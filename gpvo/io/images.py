@@ -134,7 +134,8 @@ class ImageSource(ABC):
         if rig.baseline_m > LONG_BASELINE_M:
             self.known.note(f"baseline {rig.baseline_m:.2f} m: are the translations in metres?")
         if rig.is_upright:
-            self.known.note("one camera sits above the other: images are turned by a quarter, so that rows are aligned")
+            turned = "images, and axes of motions, are turned by a quarter"
+            self.known.note(f"the calibration places one camera above the other: {turned}")
         self.report = self._fresh_report()
         R_rect_left = self.rectifier.R_rect_left.tolist()
         self.calibration: dict[str, Any] | None = {**rig.describe(), "R_rect_left": R_rect_left}
