@@ -135,16 +135,15 @@ class Columns(Sequence[_Item], ABC):
         """One after the other; of mappings by method or stage, with those of all, NaN where a part has none. Where
         their ``count`` of rows is known, one part is in memory at a time."""
         if count is None:
-            parts = list(parts)
-            count = sum(map(len, parts))
+            count = sum(map(len, parts := list(parts)))
         joined, end = {name: dict[str, NDArray[Any]]() for name in field_names(cls)}, 0
         for part in parts:
             start, end = end, end + len(part)
             for field_name, columns in joined.items():
                 for name, column in getattr(part, field_name).items():
                     if name not in columns:
-                        fill = np.nan if column.dtype.kind == "f" else 0
-                        columns[name] = np.full((count, *column.shape[1:]), fill, dtype=column.dtype)
+                        shape, fill = (count, *column.shape[1:]), np.nan if column.dtype.kind == "f" else 0
+                        columns[name] = np.full(shape, fill, column.dtype)
                     columns[name][start:end] = column
         return cls(**joined)
 
@@ -339,8 +338,7 @@ class VoLog:
     def rows(self, keep: NDArray[np.bool_] | slice) -> VoLog:
         """A part of the records: those marked (N,), or a stretch."""
         if not isinstance(self.records, StoredRecords):
-            kept = np.arange(len(self))[keep].tolist()
-            return replace(self, records=[self.records[k] for k in kept])
+            return replace(self, records=[self.records[k] for k in np.arange(len(self))[keep].tolist()])
         maps = (getattr(self.records, f.name) for f in fields(StoredRecords))
         return replace(self, records=StoredRecords(*({name: c[keep] for name, c in m.items()} for m in maps)))
 
