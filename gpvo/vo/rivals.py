@@ -151,7 +151,7 @@ class Standing:
 
     before: float | None = None  # log odds by the frames before; None at the beginning of a motion
     mean: Array = field(default_factory=lambda: np.zeros(6))  # of the velocities followed so far, per second
-    square: Array = field(default_factory=lambda: np.diag([1.0] * 3 + [0.25] * 3))  # mean of their outer products
+    square: Array = field(default_factory=lambda: np.diag([1.0] * 3 + [0.01] * 3))  # mean of their outer products
     age_s: float = 1.0
 
     def wrong(self, share: float, *, goes_on: bool, felt: float) -> float:
