@@ -214,6 +214,10 @@ class FolderLock:
             cure = "wait for it, or choose another folder with -o"
             raise OutputError("is being written by another process", where=where or path, cure=cure) from None
 
+    def holds(self, path: Path) -> bool:
+        """Whether ``path`` is locked by this: not where there are no locks, nor what was removed meanwhile."""
+        return self._handle >= 0 and os.path.samestat(os.fstat(self._handle), path.lstat())
+
     def release(self) -> None:
         """Let others write; a second time does nothing."""
         if self._handle >= 0:

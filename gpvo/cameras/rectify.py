@@ -84,9 +84,7 @@ class Rectifier:
     def _virtual_camera(self, hfov_deg: float | None, size: tuple[int, int] | None) -> StereoCamera:
         lenses = (self.rig.left, self.rig.right)
         left = self.rig.left
-        f = float(
-            np.mean([[c.fx_px, c.fy_px] for c in lenses] * np.array([[1.0], [left.width / self.rig.right.width]]))
-        )
+        f = float(np.mean([[c.fx_px, c.fy_px] for c in lenses] * np.array([[1.0], [self.rig.resolution]])))
         width, height = (left.height, left.width) if self.rig.is_upright else (left.width, left.height)
         width, height = size or (width, height)
         if min(width, height) < 16 or not is_plausible((width, height)):

@@ -52,8 +52,7 @@ class StereoRig:
                 raise CalibrationError(text, where=self.where)
         check_pose(self.T_right_left, "T_right_left", self.where)
         _check_baseline(self)
-        # Over their widths: sensors of one view may differ in resolution.
-        a, b = self.left.fx_px / self.left.width, self.right.fx_px / self.right.width
+        a, b = self.left.fx_px, self.right.fx_px * self.resolution
         if max(a, b) / min(a, b) > MAX_FOCAL_RATIO:
             focal = f"{self.left.fx_px:.1f} px and {self.right.fx_px:.1f} px"
             text = f"focal lengths of {focal} do not make a stereo pair"
@@ -64,6 +63,13 @@ class StereoRig:
     def baseline_m(self) -> float:
         """Distance of the optical centres [m]."""
         return float(np.linalg.norm(self.T_right_left[:3, 3]))
+
+    @property
+    def resolution(self) -> float:
+        """Pixels of the left camera per pixel of the right one: of one view that sensors of other resolution see, that
+        of their widths; 1 where the focal lengths in pixels are nearer to each other, as where an image is a part."""
+        ratio, of_focal = self.left.width / self.right.width, self.left.fx_px / self.right.fx_px
+        return ratio if abs(np.log(of_focal / ratio)) < abs(np.log(of_focal)) else 1.0
 
     @property
     def is_upright(self) -> bool:
@@ -172,13 +178,13 @@ def _check_baseline(rig: StereoRig) -> None:
         text = f"the cameras are rotated by {np.rad2deg(angle):.0f} degrees to each other, too far for stereo"
         raise CalibrationError(text, where=where, cure="check the order and the direction of the chained transforms")
     x, y, z = mean_view(T)[1]
-    if x < -0.7:
-        text = f"the right camera sits {length * 1e3:.0f} mm to the left of the left one: left and right are swapped"
-        raise CalibrationError(text, where=where, cure="swap the two cameras, or invert the transform between them")
     if np.hypot(x, y) < 0.7:
         text = f"the right camera sits in front of or behind the left one, direction ({x:.2f}, {y:.2f}, {z:.2f})"
         cure = "the pair must sit side by side, or one above the other, in image axes; check the chained transforms"
         raise CalibrationError(text, where=where, cure=cure)
+    if x < 0 and abs(x) >= abs(y):
+        text = f"the right camera sits {length * 1e3:.0f} mm to the left of the left one: left and right are swapped"
+        raise CalibrationError(text, where=where, cure="swap the two cameras, or invert the transform between them")
 
 
 @dataclass(frozen=True)

@@ -160,7 +160,8 @@ def twins_of(runs: Sequence[Path], settings: TwinSettings, jobs: int = 1) -> Ite
             place = folder.lstat()
             if not S_ISDIR(place.st_mode) or (hasattr(os, "getuid") and place.st_uid != os.getuid()):
                 raise OutputError("is somebody else's", where=folder)
-            stack.enter_context(FolderLock(folder))
+            if not stack.enter_context(FolderLock(folder)).holds(folder):
+                raise OutputError("cannot be locked", where=folder)
         except (OSError, OutputError):  # or the same command runs already
             folder = Path(stack.enter_context(TemporaryDirectory(prefix="gpvo-twins-")))
         try:

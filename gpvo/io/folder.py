@@ -75,7 +75,7 @@ class FolderSource(FileSource):
     @classmethod
     def recognises(cls, path: Path) -> bool:
         """A folder with a pair of image folders or left and right images."""
-        return path.is_dir() and (_folder_pair(path) is not None or all(_side_files(path)))
+        return path.is_dir() and all(_find_images(path))
 
 
 def _is_image(path: Path) -> bool:
@@ -100,18 +100,13 @@ def _pair_of(named: dict[str, T]) -> tuple[T, T] | None:
 
 
 def _folder_pair(path: Path) -> tuple[Path, Path] | None:
-    """The folders of both cameras: named by their sides, or the only two with images whose names have a side at one end
-    and are else the same, such as stereo_left and stereo_right."""
-    folders = [f for f in sorted(path.iterdir()) if f.is_dir()]
-    if (pair := _pair_of({f.name.lower().removeprefix("image_"): f for f in folders})) is not None:
-        return pair
+    """The only two folders with images whose names have a side at one end and are else the same, such as stereo_left
+    and stereo_right."""
+    folders, pairs = [f for f in sorted(path.iterdir()) if f.is_dir() and any(_images_in(f))], []
     for pattern in _NAMES:
-        if (sides := _pair_of(_by_side([f for f in folders if any(_images_in(f))], pattern))) is not None:
-            common = sides[0].keys() & sides[1].keys()
-            if len(common) == 1:
-                stem = common.pop()
-                return sides[0][stem], sides[1][stem]
-    return None
+        left, right = _pair_of(_by_side(folders, pattern)) or ({}, {})
+        pairs += [(left[stem], right[stem]) for stem in left.keys() & right.keys()]
+    return pairs[0] if len(pairs) == 1 else None
 
 
 def _images_in(folder: Path) -> Iterator[Path]:
@@ -124,15 +119,18 @@ def _by_side(paths: list[Path], pattern: re.Pattern[str]) -> dict[str, dict[str,
     """Those with a side in their names: by side in small letters, then by what else the name holds."""
     named: dict[str, dict[str, Path]] = {}
     for path in paths:
-        if match := pattern.fullmatch(path.stem):
+        if match := pattern.fullmatch(path.name if path.is_dir() else path.stem):
             named.setdefault(match["side"].lower(), {})[match["stem"]] = path
     return named
 
 
 def _find_images(path: Path) -> tuple[dict[str, Path], dict[str, Path]]:
     """Images of both cameras, keyed by what their names have in common."""
-    if (pair := _folder_pair(path)) is None:
-        return _side_files(path)
+    pair = _pair_of({f.name.lower().removeprefix("image_"): f for f in sorted(path.iterdir()) if f.is_dir()})
+    if pair is None:
+        files = _side_files(path)
+        if all(files) or (pair := _folder_pair(path)) is None:
+            return files
     # Without a side at their ends: 000012_left and 000012 alike.
     left, right = ({_END.sub("", f.stem): f for f in sorted(_images_in(side))} for side in pair)
     return left, right

@@ -151,8 +151,8 @@ class ImageSource(ABC):
         """Number of pairs."""
 
     def __iter__(self) -> Iterator[StereoFrame]:
-        self.report = report = self._fresh_report()
-        frames = self._frames(report)
+        self.report, self.depth.span = self._fresh_report(), None
+        frames = self._frames(self.report)
         return prefetched(frames) if self._prefetch else frames
 
     def remark(self, text: str) -> None:
@@ -265,7 +265,7 @@ class OrderCheck:
 
 def is_mosaic(image: Image8) -> bool:
     """Whether grey values (H, W) alternate from pixel to pixel along rows and columns in most parts of the image, as in
-    the raw mosaic of a colour filter: green lies on every second pixel. No texture, noise or interlacing does so.
+    the raw mosaic of a colour filter: green lies on every second pixel. Hardly any texture, and no noise, does so.
 
     That component is what second differences along both axes have in common with a chequerboard.
     """
@@ -277,7 +277,7 @@ def is_mosaic(image: Image8) -> bool:
     rough[::2, 1::2] *= -1
     rough[1::2, ::2] *= -1
     tiles = cv2.resize(rough, (w // _TILE_PX, h // _TILE_PX), interpolation=cv2.INTER_AREA)
-    return bool(np.median(np.abs(tiles)) > _ALTERNATES * max(cv2.norm(rough) / np.sqrt(rough.size), 1.0))
+    return bool(np.median(np.abs(tiles)) > _ALTERNATES * max(cv2.norm(rough) / np.sqrt(rough.size), 4.0))
 
 
 def smooth_mosaic(image: Image8) -> Image8:

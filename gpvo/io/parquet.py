@@ -81,9 +81,9 @@ def write_blocks(
     # A page begins with which of its values there are, and so is known only at the end. Nameless, the room for the
     # blocks goes with the process, however it ends.
     with (
-        SpooledTemporaryFile(_SPOOL_BYTES, dir=str(path.parent)) as spool,
         replacing(path, own) as temporary,
         temporary.open("wb") as file,
+        SpooledTemporaryFile(_SPOOL_BYTES, dir=str(path.parent)) as spool,
     ):
         for block in blocks:
             count = 0

@@ -95,6 +95,8 @@ class Depth:
         low, high = (float(shown[int(share * (len(shown) - 1))]) for share in (_EXTREME, 1 - _EXTREME))
         if self.span is None and not 0 < high - low < min(low, (1 << self.bits) / 8):
             return
+        if self.span is not None and high - low > 2 * (self.span[1] - self.span[0]):
+            return  # the sun, or a picture that was read badly: it would leave nothing of all others
         if self.span is None or low < self.span[0] or high > self.span[1]:
             margin = max(high - low, 256 - (high - low)) / 2  # of half its range, and no finer than a sample's step
             least, most = self.span or (low, high)
@@ -107,13 +109,14 @@ class Depth:
         if self.most >> self.bits:
             held = f"samples reach {self.most}, more than {self.bits} bits hold"
             return f"{held}: brighter ones are clipped (--bits {self.most.bit_length()})"
+        likely, said = next(n for n in (8, 10, 12, 16) if self.most < 1 << n), []
         if self.span is not None:
             low, high = (min(max(round(s), 0), 65535) for s in self.span)
-            return f"the samples of 16-bit images keep to a small range: {low} to {high} are spread over 8 bits"
-        likely = next(n for n in (8, 10, 12, 16) if self.most < 1 << n)
+            said.append(f"the samples of 16-bit images keep to a small range: {low} to {high} are spread over 8 bits")
         if self.most and likely < self.bits == 16:
-            return f"the samples of 16-bit images reach only {self.most}: are these {likely} bits (--bits {likely})?"
-        return ""
+            reach = f"the samples of 16-bit images reach only {self.most}"
+            said.append(f"{reach}: are these {likely} bits (--bits {likely})?")
+        return "; ".join(said)
 
 
 @runtime_checkable

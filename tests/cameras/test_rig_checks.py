@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from gpvo.cameras.models import PinholeRadtan
@@ -55,6 +57,13 @@ def test_lenses_are_compared_by_what_they_see():
     """Sensors of one view may differ in resolution."""
     fine = PinholeRadtan(800.0, 800.0, 640.0, 480.0, 1280, 960)
     assert StereoRig(LENS, fine, _T(-0.1)).baseline_m == pytest.approx(0.1)
+    part = replace(LENS, width=LENS.width // 2, cx_px=LENS.cx_px / 2)
+    assert StereoRig(LENS, part, _T(-0.1)).resolution == 1.0
+
+
+def test_a_swapped_pair_set_back_is_refused():
+    with pytest.raises(CalibrationError, match="swapped"):
+        StereoRig(LENS, LENS, _T(0.069, -0.02, -0.069))
 
 
 def test_good_rigs_pass():

@@ -17,7 +17,7 @@ from gpvo.errors import CalibrationError, GpvoError, SourceError
 from gpvo.geometry import se3
 from gpvo.io import guess, open_source
 from gpvo.io.images import is_mosaic, smooth_mosaic
-from gpvo.io.source import Source, source_kinds
+from gpvo.io.source import Depth, Source, source_kinds
 from gpvo.vo.rig_findings import camchain
 
 MAKERS = {"euroc": seq.write_euroc, "kitti": seq.write_kitti, "folder": seq.write_folder}
@@ -259,6 +259,24 @@ def test_folder_names(tmp_path, left, right):
         (path / empty).mkdir()
     assert guess(path) == "folder"
     assert [k for _, k in seq.frames_of(open_source(path))] == list(range(12))
+
+
+def test_a_hot_picture_takes_no_contrast_from_later_ones():
+    depth, scene = Depth(), np.linspace(7300, 7600, 64 * 64).reshape(64, 64).astype(np.uint16)
+    before, hot = depth.to8(scene), scene.copy()
+    hot[:4] = 16383
+    depth.to8(hot)
+    np.testing.assert_array_equal(depth.to8(scene), before)
+
+
+def test_pairs_of_images_are_read_before_folders_beside_them(tmp_path):
+    for name in ("{0}_{1}", "mask_{1}/{0}"):
+        for k in range(3):
+            for side in ("left", "right"):
+                image = seq.grey(k) if "mask" not in name else np.full_like(seq.grey(k), 255)
+                seq.write_image(tmp_path / f"{name.format(k, side)}.png", image)
+    (tmp_path / "camchain.yaml").write_text(seq.camchain_yaml())
+    assert [k for _, k in seq.frames_of(open_source(tmp_path, rate_hz=20.0))] == [0, 1, 2]
 
 
 def test_of_several_pairs_of_folders_none_is_guessed(tmp_path):
