@@ -75,7 +75,7 @@ class FolderSource(FileSource):
     @classmethod
     def recognises(cls, path: Path) -> bool:
         """A folder with a pair of image folders or left and right images."""
-        return path.is_dir() and all(_find_images(path))
+        return path.is_dir() and (_named_pair(path) is not None or all(_find_images(path)))
 
 
 def _is_image(path: Path) -> bool:
@@ -97,6 +97,11 @@ def _list_pairs(path: Path, rate_hz: float | None, tolerance_s: float, known: So
 def _pair_of(named: dict[str, T]) -> tuple[T, T] | None:
     """What belongs to the left and to the right side, by names of sides in small letters."""
     return next(((named[a], named[b]) for a, b in _PAIRS if a in named and b in named), None)
+
+
+def _named_pair(path: Path) -> tuple[Path, Path] | None:
+    """The folders that are named by their sides."""
+    return _pair_of({f.name.lower().removeprefix("image_"): f for f in sorted(path.iterdir()) if f.is_dir()})
 
 
 def _folder_pair(path: Path) -> tuple[Path, Path] | None:
@@ -126,8 +131,7 @@ def _by_side(paths: list[Path], pattern: re.Pattern[str]) -> dict[str, dict[str,
 
 def _find_images(path: Path) -> tuple[dict[str, Path], dict[str, Path]]:
     """Images of both cameras, keyed by what their names have in common."""
-    pair = _pair_of({f.name.lower().removeprefix("image_"): f for f in sorted(path.iterdir()) if f.is_dir()})
-    if pair is None:
+    if (pair := _named_pair(path)) is None:
         files = _side_files(path)
         if all(files) or (pair := _folder_pair(path)) is None:
             return files
