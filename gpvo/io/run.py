@@ -32,7 +32,7 @@ from gpvo.io.run_read import SCHEMA, Run, read_predictions, read_run, read_track
 from gpvo.io.snapshot import save_snapshot
 from gpvo.io.trajectory import tum_line
 from gpvo.types import Array, ImuLog, Mounting, Prediction, StereoCamera, StereoTracks, TruthLog, VoLog, VoRecord
-from gpvo.types.records import batches
+from gpvo.types.columns import batches
 
 __all__ = [
     "Run",

@@ -23,7 +23,7 @@ from gpvo.geometry.covariance import variances
 from gpvo.online.features import AXES
 from gpvo.publish.odometry import Odometry
 from gpvo.types import Array
-from gpvo.types.records import batches
+from gpvo.types.columns import batches
 
 CONSUMERS = ("px4", "ardupilot", "robot_localization", "fusioncore")
 

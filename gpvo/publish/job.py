@@ -18,7 +18,7 @@ from gpvo.io.run import Run, read_run
 from gpvo.io.stamps import END_OF_ROS_NS
 from gpvo.online.predictor import Predictor
 from gpvo.publish import PublishSettings, consumers, mavlink, ros
-from gpvo.publish.odometry import Odometry, OdometryBuilder
+from gpvo.publish.odometry import Odometry, OdometryBuilder, messages
 from gpvo.types import Prediction, VoRecord
 
 TARGETS = ("bag", "mcap", "mavlink")
@@ -137,8 +137,8 @@ def odometry_of(
     pose."""
     builder = OdometryBuilder(T_body_cam=run.mounting.T_body_cam, method=settings.method)
     try:
-        for record in run.log:
-            yield replace(builder.step(record, stated(record)), child_frame_id=run.mounting.body)
+        for o in messages(run.log, stated, builder):
+            yield replace(o, child_frame_id=run.mounting.body)
     except GpvoError as error:
         raise GpvoError(error.what, where=run.path, cure=error.cure) from None
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass, field, replace
 
 import numpy as np
@@ -228,8 +228,8 @@ def _status(record: VoRecord, prediction: Prediction | None) -> Status:
 
 
 def messages(
-    records: Iterable[VoRecord], predictions: Mapping[int, Prediction], builder: OdometryBuilder
+    records: Iterable[VoRecord], stated: Callable[[VoRecord], Prediction | None], builder: OdometryBuilder
 ) -> Iterator[Odometry]:
-    """Messages of a whole log; ``predictions`` by ``t_ns``."""
+    """Messages of a whole log, with the prediction ``stated`` of each record in turn."""
     for record in records:
-        yield builder.step(record, predictions.get(record.t_ns))
+        yield builder.step(record, stated(record))

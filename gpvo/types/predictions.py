@@ -11,7 +11,8 @@ from typing import Any, TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
-from gpvo.types.records import Columns, Status, VoLog, batches
+from gpvo.types.columns import Columns, batches
+from gpvo.types.records import Status, VoLog
 from gpvo.types.sensors import Array
 
 _SAME_S = 1e-6

@@ -132,14 +132,15 @@ class StereoOdometry:
             doubts=doubts,
         )
         moved = self.rig_error.moved
-        record = self._record(frame.t_ns, guess, matches, motion, verdict, choice.otherwise)
+        parallax_px = 0.0 if motion is None else median_parallax_px(matches, motion.inliers)
+        record = self._record(frame.t_ns, guess, matches, motion, verdict, choice.otherwise, parallax_px)
         if self.rig_error.moved > moved:
             self.pair.note("moved", seen=True)
             reason = "; ".join(filter(None, [record.reason, "the cameras have moved against one another"]))
             status = Status.DEGRADED if record.status is Status.OK else record.status
             record = replace(record, status=status, reason=reason)
         clock.lap("covariance")
-        is_reference, counts = self._advance(record, matches, motion, choice)
+        is_reference, counts = self._advance(record, matches, motion, choice, parallax_px)
         self._window.advance(is_reference)
         clock.lap("reference")
         sensed = self._imu.with_later(piece)
@@ -295,10 +296,11 @@ class StereoOdometry:
         return replace(motion, inliers=inliers)
 
     def _record(
-        self, t_ns: int, guess: Array, matches: Matches, motion: Motion | None, verdict: Verdict, otherwise: Array
-    ) -> VoRecord:
-        """The record of this motion, still without counts and image statistics of the new reference. ``otherwise``:
-        covariance (6, 6) of being the wrong one of several motions."""
+        self, t_ns: int, guess: Array, matches: Matches, motion: Motion | None, verdict: Verdict, otherwise: Array,
+        parallax_px: float,
+    ) -> VoRecord:  # fmt: skip
+        """The record of this motion, over which the image moved by ``parallax_px``, still without counts and image
+        statistics of the new reference. ``otherwise``: covariance (6, 6) of being the wrong one of several motions."""
         assert self._state is not None
         state, config = self._state, self.config
         record = VoRecord(t_ns, state.t_ref_ns, verdict.status, guess, reason=verdict.reason)
@@ -340,7 +342,7 @@ class StereoOdometry:
             row_error, least_px = matches.row_error[motion.inliers], max(config.min_disparity_px, KNOWN_DEPTH_PX)
             # An image at rest says nothing of depth, but with a wrong rig, what begins to move slowly fits one motion
             # with what stays. Other doubts may come from the rig's own errors, which only learning ends.
-            moves = median_parallax_px(matches, motion.inliers) >= config.keyframe_parallax_px
+            moves = parallax_px >= config.keyframe_parallax_px
             learnt = self.rig_error.update(
                 motion,
                 white,
@@ -360,7 +362,7 @@ class StereoOdometry:
         )
 
     def _advance(
-        self, record: VoRecord, matches: Matches, motion: Motion | None, choice: Choice
+        self, record: VoRecord, matches: Matches, motion: Motion | None, choice: Choice, parallax_px: float
     ) -> tuple[bool, tuple[int, int]]:
         """Choose the reference of the next motion; whether it is this frame, and the counts of points."""
         assert self._frontend is not None
@@ -379,7 +381,6 @@ class StereoOdometry:
             state.restart(record.t_ns, counts[1])
             return True, counts
         inliers = motion.inliers
-        parallax_px = median_parallax_px(matches, inliers)
         sigma_m = motion.worst_translation_sigma_m
         state.believe(record.t_ns, record.T_prev_cur, parallax_px, int(inliers.sum()), choice, sigma_m)
         if record.status is Status.OK:

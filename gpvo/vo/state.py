@@ -206,8 +206,7 @@ class State:
         if self.felt is None or self.felt.span is None:
             return
         now = self._velocity(t_ns, T_ref_cur)
-        sigma_mps = sigma_m / max((t_ns - self.t_believed_ns) * 1e-9, 1e-6)
-        alone_mps = self.felt.contradicted(now, self._lag_s, sigma_mps)
+        alone_mps = self.felt.contradicted(now, self._lag_s, sigma_m / self._step_s(t_ns))
         if alone_mps is None:
             return
         if self.leaps.before is None:
@@ -276,7 +275,11 @@ class State:
     def _velocity(self, t_ns: int, T_ref_cur: Array) -> Array:
         """(6,) per second, since the last believed motion."""
         step = se3.log(se3.inverse(self.T_ref_believed) @ T_ref_cur)
-        return np.asarray(step / max((t_ns - self.t_believed_ns) * 1e-9, 1e-6))
+        return np.asarray(step / self._step_s(t_ns))
+
+    def _step_s(self, t_ns: int) -> float:
+        """Time since the last believed motion, by which velocities divide."""
+        return max((t_ns - self.t_believed_ns) * 1e-9, 1e-6)
 
     def believe(
         self, t_ns: int, T_ref_cur: Array, parallax_px: float, inliers: int, choice: Choice, sigma_m: float
@@ -288,7 +291,7 @@ class State:
             self.twist, self.t_twist_ns = self._velocity(t_ns, T_ref_cur), t_ns
             self.twist_over_s = (t_ns - self.t_believed_ns) * 1e-9
             if self.felt is not None:
-                sigma_mps = sigma_m / max((t_ns - self.t_believed_ns) * 1e-9, 1e-6)
+                sigma_mps = sigma_m / self._step_s(t_ns)
                 doubted = self.leaps.before is not None
                 self.felt.see(self.twist, sigma_mps, self._lag_s, leapt=not choice.goes_on, doubted=doubted)
         self.parallax_px = abs(parallax_px - self.parallax_from_reference_px)

@@ -15,4 +15,4 @@ def odometry() -> list[Odometry]:
     """Four seconds at 20 Hz with a tilted camera off the body's origin, and half a second of darkness."""
     flight = synthetic_flight(2, duration_s=4, law=ErrorLaw(burst_factor=10.0), events=Events(dark=(2.0, 2.5)))
     mount = se3.from_rt(R_FLU_OPTICAL @ se3.so3_exp(np.array([0.1, 0.2, 0.05])), np.array([0.4, 0.1, -0.2]))
-    return list(messages(flight.records, flight.predictions, OdometryBuilder(mount)))
+    return list(messages(flight.records, lambda r: flight.predictions.get(r.t_ns), OdometryBuilder(mount)))

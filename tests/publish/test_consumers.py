@@ -24,7 +24,7 @@ from synthetic_flights import ErrorLaw, synthetic_flight
 @pytest.fixture(scope="module")
 def odometry() -> list[Odometry]:
     flight = synthetic_flight(5, duration_s=5, law=ErrorLaw(burst_factor=10.0))
-    return list(messages(flight.records, flight.predictions, OdometryBuilder()))[1:]
+    return list(messages(flight.records, lambda r: flight.predictions.get(r.t_ns), OdometryBuilder()))[1:]
 
 
 def check(odometry: Sequence[Odometry], consumer: str) -> list[consumers.Verdict]:

@@ -81,7 +81,7 @@ def test_accumulated_pose_covariance_against_monte_carlo(parts: tuple[float, flo
 
 def test_lost_frames_hold_the_pose_and_widen_it() -> None:
     flight = synthetic_flight(0, duration_s=6, events=Events(dark=(2.0, 4.0)))
-    out = list(messages(flight.records, flight.predictions, OdometryBuilder(floor=TINY)))
+    out = list(messages(flight.records, lambda r: flight.predictions.get(r.t_ns), OdometryBuilder(floor=TINY)))
     lost = [o for o in out if o.status is Status.LOST]
     assert len(lost) == 40
     assert all(o.twist_body is None and not o.tracked for o in lost)
@@ -183,11 +183,11 @@ def test_a_restart_of_the_source_is_one_reset() -> None:
 
 def test_a_record_that_is_sent_twice_or_is_no_number_moves_nothing() -> None:
     flight = synthetic_flight(0, duration_s=2)
-    plain = list(messages(flight.records, flight.predictions, OdometryBuilder()))
+    plain = list(messages(flight.records, lambda r: flight.predictions.get(r.t_ns), OdometryBuilder()))
     bad = replace(flight.records[20], T_prev_cur=np.full((4, 4), np.nan), is_reference=False)
     for extra in (flight.records[19:20] * 3, [bad]):
         records = [*flight.records[:20], *extra, *flight.records[20:]]
-        out = list(messages(records, flight.predictions, OdometryBuilder()))
+        out = list(messages(records, lambda r: flight.predictions.get(r.t_ns), OdometryBuilder()))
         assert all(o.twist_body is None for o in out[20 : 20 + len(extra)])
         for o in out:
             np.linalg.cholesky(o.pose_covariance)
@@ -201,9 +201,9 @@ def test_records_that_were_missed_are_part_of_what_is_unknown(missed: int) -> No
     wide = []
     for seed in range(4):
         flight = synthetic_flight(seed, duration_s=2)
-        plain = list(messages(flight.records, flight.predictions, OdometryBuilder()))
+        plain = list(messages(flight.records, lambda r, of=flight: of.predictions.get(r.t_ns), OdometryBuilder()))
         few = [*flight.records[:20], *flight.records[20 + missed :]]
-        out = list(messages(few, flight.predictions, OdometryBuilder()))
+        out = list(messages(few, lambda r, of=flight: of.predictions.get(r.t_ns), OdometryBuilder()))
         assert (plain[-1].reset_counter, out[-1].reset_counter) == (0, 1)
         off = se3.log(se3.inverse(plain[-1].T_odom_body) @ out[-1].T_odom_body)
         wide.append(np.abs(off[:3]).max() / np.sqrt(np.diagonal(out[-1].pose_covariance)[:3].max()))
@@ -353,7 +353,7 @@ def test_the_covariance_of_a_pose_is_not_published_as_that_of_a_motion() -> None
 
 def test_every_covariance_of_a_bursty_flight_is_positive_definite() -> None:
     flight = synthetic_flight(1, duration_s=10, law=ErrorLaw(burst_factor=10.0))
-    for out in messages(flight.records, flight.predictions, OdometryBuilder(MOUNT)):
+    for out in messages(flight.records, lambda r: flight.predictions.get(r.t_ns), OdometryBuilder(MOUNT)):
         np.linalg.cholesky(out.pose_covariance)
         if out.twist_covariance is not None:
             np.linalg.cholesky(out.twist_covariance)
