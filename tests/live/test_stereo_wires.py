@@ -41,7 +41,8 @@ def offline(clip: Path, stamps: list[int]) -> list[Odometry]:
     predictor.reset(rectifier.camera)
     log = VoLog([odometry.step(frame) for frame in frames], rectifier.camera)
     builder = OdometryBuilder(method="pointing_matching")
-    return [m for m in messages(log, predictor.replay(log), builder) if m.twist_body is not None]
+    predictions = predictor.replay(log)
+    return [m for m in messages(log, lambda r: predictions.get(r.t_ns), builder) if m.twist_body is not None]
 
 
 @pytest.mark.parametrize("wire", WIRES)
