@@ -365,3 +365,28 @@ class Blocks:
         """Only what was added to ``before`` counts, and blocks that the change lies in tell nothing of their excess."""
         self.sums = self.sums.since(before)
         self._count, self._before, self._scatter = 0, self.sums, self._scatter_earlier
+
+
+@dataclass(frozen=True)
+class Gaussians:
+    """K beliefs about n coefficients, of one mean: ``precision`` (K, n, n), ``score`` (K, n), precision times mean,
+    ``log_det`` (K,) of the precision, and ``at_mean`` (K,), the mean times the score."""
+
+    precision: Array
+    score: Array
+    log_det: Array
+    at_mean: Array
+
+    @classmethod
+    def of(cls, mean: Array, covariance: Array) -> Gaussians:
+        """Of a mean (n,) and covariances (K, n, n)."""
+        precision = np.asarray(np.linalg.inv(covariance), np.float64)
+        score = precision @ mean
+        return cls(precision, score, np.linalg.slogdet(precision)[1], score @ mean)
+
+    def given(self, information: Array, score: Array) -> tuple[Array, Array, Array]:
+        """Precisions (K, n, n), means (K, n) and log evidence (K,), up to a common term, after measurements."""
+        precision, total = self.precision + information, self.score + score
+        mean = np.asarray(np.linalg.solve(precision, total[..., None])[..., 0], np.float64)
+        log_det = self.log_det - np.linalg.slogdet(precision)[1]
+        return precision, mean, 0.5 * ((mean * total).sum(axis=1) - self.at_mean + log_det)

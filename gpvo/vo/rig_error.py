@@ -36,7 +36,7 @@ from numpy.typing import NDArray
 
 from gpvo.stats.series import median
 from gpvo.types import Array, StereoCamera
-from gpvo.vo.covariance import Blocks, Sums
+from gpvo.vo.covariance import Blocks, Gaussians, Sums
 from gpvo.vo.motion import NO_TWIST, Motion, Whitened, apply_whitener, mistakable, right_velocity
 
 _HIGHEST = 4  # order
@@ -61,6 +61,7 @@ _LATE_S = 2e-3  # of cameras that are not triggered together: software that star
 # Rigs that are not exact: their mounting, and apart from it their lenses, are so many times as wrong, equally likely.
 # A camera can be knocked by any angle; a lens stays what it is.
 _MOUNTINGS, _LENSES = (0.3, 1.0, 4.0, 16.0), (0.3, 1.0, 4.0)
+_EXACT_LENS = 0.01  # times as wrong as usual, as good as exact
 _ROLLS = (1.0, 16.0)  # the same of the turn about the optical axis, which rows show at once
 _NEGLIGIBLE = 1e-12  # probability of a kind
 _STEP, _STEPS = 5, 20  # motions from one look for a move of the cameras to the next; of those looked back over
@@ -148,8 +149,11 @@ class RigError:
         self._motions, self._past = 0, deque[tuple[tuple[Sums, ...], RigState]](maxlen=_STEPS)
         covariances = [prior_covariance(camera, *kind) for kind in product(_MOUNTINGS, _LENSES, _ROLLS)]
         # A state from a file is no calibration to return to.
-        self._kinds = _Gaussians.of(self.state.mean, np.stack(covariances if known is None else [known.covariance]))
-        self._exact = _Gaussians.of(np.zeros(_N), prior_covariance(camera, roll=0.0)[_IN_DY][None])
+        self._kinds = Gaussians.of(self.state.mean, np.stack(covariances if known is None else [known.covariance]))
+        self._exact = Gaussians.of(np.zeros(_N), prior_covariance(camera, roll=0.0)[_IN_DY][None])
+        self._exact_lenses = Gaussians.of(
+            self.state.mean, np.stack([prior_covariance(camera, m, _EXACT_LENS) for m in _MOUNTINGS])
+        )
         self.state = self._mixed(np.zeros_like(precision), np.zeros(len(precision)))
 
     def correct(self, uvd: Array, twist: Array | None = None) -> Array:
@@ -289,7 +293,7 @@ class RigError:
             for block, before in zip(self._blocks, sums, strict=True):
                 block.forget(before)
             turned = _KNOCK_RAD**2 * _TURNS @ _TURNS.T + _JOLT**2 * prior_covariance(self._camera)
-            self._kinds = _Gaussians.of(state.mean, (state.covariance + turned)[None])
+            self._kinds = Gaussians.of(state.mean, (state.covariance + turned)[None])
             self.moved += 1
             self._past.clear()
 
@@ -330,7 +334,14 @@ class RigError:
         covariance = np.tensordot(weight[:-1][likely], squares, 1)
         exact = np.linalg.inv(row_precision[0]) + np.outer(row_means[0], row_means[0])
         covariance[N_TERMS:, N_TERMS:] += weight[-1] * exact
+        covariance[:N_TERMS, :N_TERMS] += weight[-1] * self._untold(information, score, float(exact_evidence[0]))
         return RigState(mean, covariance - np.outer(mean, mean), float(1.0 - weight[-1]))
+
+    def _untold(self, information: Array, score: Array, exact_evidence: float) -> Array:
+        """(15, 15) of the disparities of a rig that looks exact: exact lenses tell nothing of how they are mounted."""
+        precision, _, evidence = self._exact_lenses.given(information, score)
+        weight = np.exp(evidence - np.logaddexp.reduce(np.append(evidence, exact_evidence + np.log(len(evidence)))))
+        return np.asarray(np.tensordot(weight, np.linalg.inv(precision)[:, :N_TERMS, :N_TERMS], 1))
 
     def _terms(self, uvd: Array, twist: Array, late_s: float = 0.0) -> Array:
         """(2, 16, N) derivatives of dx and of dy by their coefficients, at the place in the right image, from where
@@ -354,31 +365,6 @@ class RigError:
         displaced = mean[:LATE].reshape(2, -1) @ self._at(uvd)
         displaced += mean[LATE] * right_velocity(self.twist if twist is None else twist, uvd, c)
         return -c.fx_px * displaced[0], c.fy_px * displaced[1]
-
-
-@dataclass(frozen=True)
-class _Gaussians:
-    """K beliefs about n coefficients, of one mean: ``precision`` (K, n, n), ``score`` (K, n), precision times mean,
-    ``log_det`` (K,) of the precision, and ``at_mean`` (K,), the mean times the score."""
-
-    precision: Array
-    score: Array
-    log_det: Array
-    at_mean: Array
-
-    @classmethod
-    def of(cls, mean: Array, covariance: Array) -> _Gaussians:
-        """Of a mean (n,) and covariances (K, n, n)."""
-        precision = np.asarray(np.linalg.inv(covariance), np.float64)
-        score = precision @ mean
-        return cls(precision, score, np.linalg.slogdet(precision)[1], score @ mean)
-
-    def given(self, information: Array, score: Array) -> tuple[Array, Array, Array]:
-        """Precisions (K, n, n), means (K, n) and log evidence (K,), up to a common term, after measurements."""
-        precision, total = self.precision + information, self.score + score
-        mean = np.asarray(np.linalg.solve(precision, total[..., None])[..., 0], np.float64)
-        log_det = self.log_det - np.linalg.slogdet(precision)[1]
-        return precision, mean, 0.5 * ((mean * total).sum(axis=1) - self.at_mean + log_det)
 
 
 def _odds_of_a_turn(state: RigState, information: Array, score: Array) -> float:
