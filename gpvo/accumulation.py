@@ -19,8 +19,8 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from gpvo.geometry import se3
-from gpvo.geometry.covariance import change_body, symmetrise
-from gpvo.types import Array, MotionError
+from gpvo.geometry.covariance import change_body, scaled_root, symmetrise
+from gpvo.types import Array, MotionError, VoRecord
 
 _E, _N = slice(0, 6), slice(6, 12)
 _U = 12
@@ -67,6 +67,34 @@ def between_ends(T_last_cur: Array, last: MotionError, error: MotionError, dt_s:
     before, now = both.persistent_root
     changed, new = now * kept - moved @ before, now * np.sqrt(1.0 - kept**2)
     return np.asarray(own[1] + moved @ own[0] @ moved.T + changed @ changed.T + new @ new.T)
+
+
+def measured(record: VoRecord, method: str) -> MotionError:
+    """The error of a record's motion by one of its covariances. Raises KeyError where it has none of this name."""
+    shared = sum(record.shared.values(), np.zeros((6, 6)))
+    return with_shared(record.covariances[method], shared, record.T_prev_cur, dt_s=record.dt_s)
+
+
+def with_shared(covariance: Array, shared: Array, T_prev_cur: Array, *, dt_s: float = 0.0) -> MotionError:
+    """An error of this covariance (6, 6), of which ``shared`` (6, 6) comes from what all motions have in common.
+
+    A wrong calibration makes the same error of all motions in one direction, and the opposite one of the way back: to
+    first order it bends the scene, and motion is in proportion. So the translation's shared error has a vector for each
+    direction of motion, and the rotation's goes with it; the rest of the rotation's counts as white.
+    """
+    length = float(np.linalg.norm(T_prev_cur[:3, 3]))
+    if not (length > 0.0 and shared.any()):
+        return MotionError.independent(covariance, dt_s=dt_s)
+    root = scaled_root(shared[:3, :3])
+    both = np.concatenate([root, np.linalg.lstsq(root, shared[:3, 3:], rcond=None)[0].T])
+    return MotionError(
+        mean=np.zeros(6),
+        jitter=np.zeros((6, 6)),
+        white=symmetrise(covariance - both @ both.T),
+        persistent_root=np.kron(T_prev_cur[:3, 3] / length, both),
+        persistent_tau_s=np.full(9, np.inf),
+        dt_s=dt_s,
+    )
 
 
 def persistence(dt_s: ArrayLike, tau_s: Array) -> Array:

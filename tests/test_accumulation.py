@@ -18,10 +18,11 @@ from gpvo.accumulation import (
     from_start,
     independent_part,
     over_windows,
+    with_shared,
 )
 from gpvo.geometry import se3
 from gpvo.geometry.covariance import scaled_root
-from gpvo.types import MotionError, Status
+from gpvo.types import Array, MotionError, Status
 
 from motion_errors import motion_error
 
@@ -180,3 +181,31 @@ def test_what_calibration_adds_on_the_way_out_it_takes_back_on_the_way_home(fram
     for k in range(frames):
         pose = pose.after(np.eye(4), motion_error(zero, white, zero, 1.0, L if k % 2 == 0 else -L, np.inf))
     np.testing.assert_allclose(pose.covariance, frames * white + frames % 2 * L @ L.T, atol=1e-9)
+
+
+def _covariance(rng: np.random.Generator) -> Array:
+    root = rng.normal(size=(6, 8)) * np.repeat([0.02, 0.004], 3)[:, None]
+    return root @ root.T
+
+
+@pytest.mark.parametrize("seed", range(5))
+def test_what_motions_share_is_part_of_each_and_adds_up_and_is_taken_back_on_the_way_home(seed):
+    rng = np.random.default_rng(seed)
+    shared, own = _covariance(rng), 1e-8 * np.eye(6)
+    shared[3:, 3:] = shared[3:, :3] @ np.linalg.solve(shared[:3, :3], shared[:3, 3:])  # a turn that goes with the way
+    T = np.eye(4)
+    T[:3, 3] = rng.normal(size=3)
+    out, home = (with_shared(shared + own, shared, X) for X in (T, se3.inverse(T)))
+    np.testing.assert_allclose(out.covariance, shared + own, rtol=1e-9, atol=1e-12)
+    np.testing.assert_allclose(out.white, own, atol=1e-12)
+    np.testing.assert_allclose(out.persistent_root, -home.persistent_root, atol=1e-12)
+    moved = carry(T)
+    two = PoseError().after(T, out).after(T, out).covariance
+    np.testing.assert_allclose(two, (moved + np.eye(6)) @ shared @ (moved + np.eye(6)).T, atol=1e-6)
+
+
+def test_what_is_shared_by_a_camera_at_rest_has_no_direction():
+    C = np.diag([1e-4, 1e-4, 1e-4, 1e-6, 1e-6, 1e-6])
+    error = with_shared(C, 0.5 * C, np.eye(4))
+    assert not error.persistent.any()
+    np.testing.assert_array_equal(error.covariance, C)

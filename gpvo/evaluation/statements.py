@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Any, Generic, TypeVar
 
 import numpy as np
 
+from gpvo.accumulation import with_shared
 from gpvo.geometry import se3
 from gpvo.geometry.covariance import where_stated
 from gpvo.learning.methods import simple_covariances
@@ -84,7 +85,8 @@ def _simple(log: VoLog, arrays: Mapping[str, Any], name: str) -> Statement:
     elif name != method and not is_vt:
         # The scale was fitted to measured motions; what is said of a lost one is no pixel noise and stands.
         C = np.where(log.usable[:, None, None], C, stated[method])
-    return plain_statement(log, name, C)
+    shared = simple_covariances(arrays, {method: log.shared_by_all}, {}, len(log)).get(name)
+    return plain_statement(log, name, C, shared if method in log.methods else None)
 
 
 def _frames_bridged(log: VoLog) -> Array:
@@ -103,18 +105,21 @@ def gp_statement(log: VoLog, model: ThesisModel) -> Statement:
     return replace(stated, mean=np.where(usable, mean, 0.0))
 
 
-def plain_statement(log: VoLog, method: str, covariance: Array) -> Statement:
-    """A method that takes motions as independent, without a mean: covariances (N, 6, 6), NaN where it says nothing; or
-    (N, 3, 3) of translations alone, which do not add up to poses."""
+def plain_statement(log: VoLog, method: str, covariance: Array, shared: Array | None = None) -> Statement:
+    """A method without a mean: covariances (N, 6, 6), NaN where it says nothing, (N, 6, 6) of it ``shared``
+    by all motions and the rest independent; or (N, 3, 3) of translations alone, which do not add up to poses."""
     mean = np.broadcast_to(np.zeros(6), (len(log), 6))
     if covariance.shape[-1] == 3:
         return Statement(method, mean, covariance, None)
     # A motion that nobody vouches for enters the sum with what was said of the one before.
-    vouched = np.where(np.isfinite(covariance).all(axis=(1, 2)), np.arange(len(log)), -1)
-    source, dt_s = np.maximum.accumulate(vouched), log.column("dt_s")
+    usable, vouched = log.usable, np.where(np.isfinite(covariance).all(axis=(1, 2)), np.arange(len(log)), -1)
+    source, dt_s, T = np.maximum.accumulate(vouched), log.column("dt_s"), log.T_prev_cur
 
     def held(k: int) -> MotionError:
-        return MotionError.independent(_NOTHING if source[k] < 0 else covariance[source[k]], dt_s=float(dt_s[k]))
+        C = _NOTHING if source[k] < 0 else covariance[source[k]]
+        if shared is None or vouched[k] < 0 or not usable[k]:
+            return MotionError.independent(C, dt_s=float(dt_s[k]))
+        return with_shared(C, shared[k], T[k], dt_s=float(dt_s[k]))
 
     return Statement(method, mean, covariance, _Rows(held, len(log)))
 

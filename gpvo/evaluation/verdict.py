@@ -282,7 +282,7 @@ def _of_frames(turned: FixedRotation, camera: StereoCamera | None) -> str:
     parts = [f"a fixed rotation of {turned.angle_deg:.2f} deg"] * is_turned
     parts += [f"a lever arm of {turned.lever_m:.3g} m"] * (turned.lever_m > 0)
     size = _of_size("motions are", turned.scale, camera) if turned.scale != 1.0 else ""
-    if size and not turned.align_change:  # --align fits no size, and beside it there is nothing left to fit
+    if size and not (parts and turned.align_change):  # --align fits no size, and there is nothing else to fit
         return f"{size} Without {' and '.join(['it', *parts])}, errors over a second are {smaller}."
     return (
         f"Truth and odometry differ by {' and '.join(parts)} (mounting, calibration, or a steady bias of the"

@@ -7,6 +7,7 @@ from typing import Protocol
 
 import numpy as np
 
+from gpvo.accumulation import measured
 from gpvo.geometry.covariance import is_positive_definite
 from gpvo.types import IMPORTED, Array, MotionError, Prediction, VoRecord
 
@@ -63,7 +64,7 @@ class GeometricPolicy:
         covariance = record.covariances.get(self.name)
         if covariance is None or not is_positive_definite(covariance):
             return None
-        return MotionError.independent(covariance, dt_s=record.dt_s).row(None)
+        return measured(record, self.name).row(None)
 
 
 @dataclass(frozen=True)

@@ -288,4 +288,5 @@ def as_stored(record: VoRecord) -> VoRecord:
     C = from_upper(upper(np.array(list(record.covariances.values())).reshape(-1, 6, 6)), 6)
     good = are_covariances(C) if record.usable else np.ones(len(C), bool)
     kept = {name: c for name, c, is_good in zip(record.covariances, C, good) if is_good}
-    return replace(record, covariances=kept)
+    shared = dict(zip(record.shared, from_upper(upper(np.array(list(record.shared.values())).reshape(-1, 6, 6)), 6)))
+    return replace(record, covariances=kept, shared=shared)

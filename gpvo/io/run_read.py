@@ -260,10 +260,15 @@ def check_log(log: VoLog, path: Path) -> None:
     for first in range(0, len(t), _AT_ONCE):
         part = log.rows(slice(first, first + _AT_ONCE))
         _check_poses(part.T_prev_cur, path, first)
+        shared = part.shared_by_all
+        _check_covariances(shared, "shared covariance", path, semi=True, first=first)
         for method in checked:
             C = part.covariance(method)
-            C = C[part.usable & ~np.isnan(C).all(axis=(1, 2))]
+            stated = part.usable & ~np.isnan(C).all(axis=(1, 2))
+            C = C[stated]
             _check_covariances(C, f"{method} covariance", path, first=checked[method])
+            if shared.any():
+                _check_covariances(C - shared[stated], f"{method} covariance, less what is shared,", path, semi=True)
             checked[method] += len(C)
 
 

@@ -2,7 +2,8 @@
 
 Units stand in the names. A pose is ``p_x_m p_y_m p_z_m`` and ``R_00`` ... ``R_22`` (exact); ``q_x q_y q_z q_w`` repeats
 the rotation for people. A 6x6 covariance is its upper triangle, row by row, ``cov_<method>_<i><j>`` with i, j in 0..5
-for x, y, z [m] and the rotations about x, y, z [rad]; ``vt_<method>_<i><j>`` is the 3x3 of the translation [m^2];
+for x, y, z [m] and the rotations about x, y, z [rad]; ``vt_<method>_<i><j>`` is the 3x3 of the translation [m^2],
+``shared_<cause>_<i><j>`` the part of every ``cov`` that all motions have in common;
 ``stage_<name>_ms`` are times. A null means that the producer did not know.
 """
 
@@ -43,7 +44,7 @@ _ROTATION = tuple(f"R_{i}{j}" for i in range(3) for j in range(3))
 _TWIST = tuple(f"v_{a}_mps" for a in _AXES) + tuple(f"w_{a}_radps" for a in _AXES)
 _IMU = {name: "{}_{{}}_{}".format(*name.rsplit("_", 1)) for name in IMU_FIELDS}
 _ALL6 = tuple((i, j) for i in range(6) for j in range(6))
-_METHOD = re.compile(r"(cov|vt)_([A-Za-z][A-Za-z0-9_]*)_00")
+_METHOD = re.compile(r"(cov|vt|shared)_([A-Za-z][A-Za-z0-9_]*)_00")
 _VELOCITY, _GYRO, _ACC = (tuple(p.format(a) for a in _AXES) for p in ("v_{}_mps", "gyro_{}_radps", "acc_{}_mps2"))
 _SIGMA6 = tuple(f"{a}_m" for a in _AXES) + tuple(f"r{a}_rad" for a in _AXES)
 _SHORT6 = tuple(a.rsplit("_", 1)[0] for a in _SIGMA6)
@@ -103,6 +104,7 @@ def record_columns(records: Sequence[VoRecord]) -> Columns:
         out |= dict(zip(map(pattern.format, _AXES), vectors.T))
     out |= _matrix_columns("cov", {m: log.covariance(m) for m in log.methods})
     out |= _matrix_columns("vt", {m: log.v_t(m) for m in log.v_t_methods})
+    out |= _matrix_columns("shared", {cause: log.shared(cause) for cause in log.causes})
     for stage in dict.fromkeys(stage for r in records for stage in r.stage_ms):
         out[f"stage_{stage}_ms"] = [r.stage_ms.get(stage) for r in records]
     return out
@@ -128,6 +130,7 @@ def records_from(columns: Mapping[str, NDArray[Any]]) -> StoredRecords:
         },
         covariances=_matrices_from(columns, "cov", 6),
         v_t=_matrices_from(columns, "vt", 3),
+        shared=_matrices_from(columns, "shared", 6),
         stage_ms={c[6:-3]: _float(columns, c, n) for c in columns if c.startswith("stage_") and c.endswith("_ms")},
     )
 

@@ -168,5 +168,6 @@ def joined(motions: list[VoRecord]) -> VoRecord:
         status=status,
         covariances=covariances,
         v_t={},
+        shared={},
         **known,
     )

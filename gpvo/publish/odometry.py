@@ -7,7 +7,7 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 
-from gpvo.accumulation import PoseError, between_ends, carry
+from gpvo.accumulation import PoseError, between_ends, carry, measured
 from gpvo.errors import GpvoError
 from gpvo.geometry import se3
 from gpvo.geometry.covariance import is_positive_definite, lost_covariance, symmetrise
@@ -147,7 +147,7 @@ class OdometryBuilder:
                 f" '{self.method}'",
                 cure=" or ".join(["give --model", *(f"--method {m}" for m in of_motions)]),
             )
-        return MotionError.independent(covariance, dt_s=record.dt_s)
+        return measured(record, self.method or "")
 
     def _twist(self, record: VoRecord, error: MotionError, chain: _Chain) -> tuple[Array, Array]:
         """Body twist since the last good frame, and its covariance.

@@ -6,6 +6,7 @@ Frame of every motion, covariance, error and feature: the rectified left optical
 
 from gpvo.types.predictions import ByStamp, MotionError, Prediction, StoredPredictions
 from gpvo.types.records import (
+    CALIBRATION,
     COUNT_FIELDS,
     FLOAT_FIELDS,
     IMPORTED,
@@ -39,6 +40,7 @@ from gpvo.types.sensors import (
 )
 
 __all__ = [
+    "CALIBRATION",
     "COUNT_FIELDS",
     "FLOAT_FIELDS",
     "IMPORTED",

@@ -19,6 +19,9 @@ from gpvo.types.sensors import VEHICLES, Array, ImuLog, StereoCamera, Vehicle
 _NUMBER = r"-?\d+(?:\.\d+)?(?:e[+-]?\d+)?"
 _KINDS: dict[str, Any] = {"int": np.int64, "bool": bool, "Status": object, "str": object}
 
+CALIBRATION = "calibration"
+"""Cause of what the errors of all motions share: what is not known of the cameras' calibration."""
+
 IMPORTED = "imported"
 """Name of the covariances that somebody else's odometry states of its own motions."""
 
@@ -51,8 +54,9 @@ class VoRecord:
 
     Counts are -1 and floats NaN where the producer does not know them. ``covariances`` (6, 6) and ``v_t``
     (3, 3, the thesis' translation-only ``V_T`` [m^2]) are keyed by method, empty where unknown. Covariances are
-    of ``T_prev_cur`` as it stands. ``imu_*`` are means and standard deviations over the interval in IMU axes,
-    None without an IMU.
+    of ``T_prev_cur`` as it stands. ``shared`` (6, 6), by cause, are the parts of each of them that all motions have in
+    common (``calibration``: what is not known of it). ``imu_*`` are means and standard deviations over the interval
+    in IMU axes, None without an IMU.
     """
 
     t_ns: int
@@ -84,6 +88,7 @@ class VoRecord:
     imu_acc_std_mps2: Array | None = None
     covariances: Mapping[str, Array] = field(default_factory=dict)
     v_t: Mapping[str, Array] = field(default_factory=dict)
+    shared: Mapping[str, Array] = field(default_factory=dict)
     stage_ms: Mapping[str, float] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
@@ -125,12 +130,14 @@ class StoredRecords(Columns[VoRecord]):
     """N records as columns, a fifth of what they take as objects.
 
     ``columns``: the fields of a record by name, (N,), (N, 4, 4) or (N, 3), an IMU's NaN throughout where there is none.
-    ``covariances`` (N, 21) and ``v_t`` (N, 6), upper triangles, and ``stage_ms`` (N,): NaN where a record has none.
+    ``covariances`` and ``shared`` (N, 21) and ``v_t`` (N, 6), upper triangles, and ``stage_ms`` (N,): NaN where a
+    record has none.
     """
 
     columns: Mapping[str, NDArray[Any]]
     covariances: Mapping[str, Array] = field(default_factory=dict)
     v_t: Mapping[str, Array] = field(default_factory=dict)
+    shared: Mapping[str, Array] = field(default_factory=dict)
     stage_ms: Mapping[str, Array] = field(default_factory=dict)
 
     @classmethod
@@ -153,6 +160,7 @@ class StoredRecords(Columns[VoRecord]):
             {f.name: column(f.name, str(f.type)) for f in fields(VoRecord) if not str(f.type).startswith("Mapping")},
             {method: log.covariance(method)[:, i, j] for method in log.methods},
             {method: log.v_t(method)[:, k, m] for method in log.v_t_methods},
+            {cause: log.shared(cause)[:, i, j] for cause in log.causes},
             {stage: np.array([r.stage_ms.get(stage, np.nan) for r in records]) for stage in stages},
         )
 
@@ -162,7 +170,8 @@ class StoredRecords(Columns[VoRecord]):
             name: column.item(k) if column.ndim == 1 else _unless_nan(column[k])
             for name, column in self.columns.items()
         }
-        for name, stated, place in (("covariances", self.covariances, _PLACE_6), ("v_t", self.v_t, _PLACE_3)):
+        for name, place in (("covariances", _PLACE_6), ("v_t", _PLACE_3), ("shared", _PLACE_6)):
+            stated = getattr(self, name)
             known[name] = {m: C[k][place] for m, C in stated.items() if _unless_nan(C[k]) is not None}
         stage_ms = {s: ms for s, column in self.stage_ms.items() if (ms := column.item(k)) == ms}
         return VoRecord(**known, stage_ms=stage_ms)
@@ -253,6 +262,11 @@ class VoLog:
         """The same of ``V_T``."""
         return self._names("v_t")
 
+    @property
+    def causes(self) -> tuple[str, ...]:
+        """The same of the errors that motions share."""
+        return self._names("shared")
+
     def _names(self, of: str) -> tuple[str, ...]:
         if isinstance(self.records, StoredRecords):
             known = {m: ~np.isnan(C).all(axis=1) for m, C in getattr(self.records, of).items()}
@@ -266,6 +280,19 @@ class VoLog:
     def v_t(self, method: str) -> Array:
         """(N, 3, 3) ``V_T`` by one method [m^2], in axes of the reference camera; NaN where a record has none."""
         return self._matrices("v_t", method, _PLACE_3)
+
+    def shared(self, cause: str) -> Array:
+        """(N, 6, 6) part of every covariance that motions have in common by one cause; NaN where a record has none."""
+        return self._matrices("shared", cause, _PLACE_6)
+
+    @property
+    def shared_by_all(self) -> Array:
+        """(N, 6, 6) the same by all causes together; zero where a record has none."""
+        total = np.zeros((len(self), 6, 6))
+        for cause in self.causes:
+            part = self.shared(cause)
+            total += np.where(np.isnan(part).all(axis=(1, 2), keepdims=True), 0.0, part)
+        return total
 
     def _matrices(self, of: str, method: str, place: NDArray[np.int64]) -> Array:
         """(N, n, n) of one method; ``place`` (n, n) of their elements in an upper triangle."""

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from gpvo.errors import CalibrationError
 from gpvo.geometry import se3
 from gpvo.geometry.covariance import lost_covariance
-from gpvo.types import Array, ImuLog, ImuMoments, Status, StereoCamera, StereoFrame, TrackFrame, VoRecord
+from gpvo.types import CALIBRATION, Array, ImuLog, ImuMoments, Status, StereoCamera, StereoFrame, TrackFrame, VoRecord
 from gpvo.vo import opencv
 from gpvo.vo.config import KNOWN_DEPTH_PX, TELLING_PX, VoConfig
 from gpvo.vo.covariance import NoiseEstimator, SigmaEstimator, covariances_by_method
@@ -336,6 +336,7 @@ class StereoOdometry:
             moved=white.moved,
             information=None if adjusted is None else adjusted.information,
         )
+        shared = dict[str, Array]()
         if self.pair.late:
             otherwise = otherwise + lateness_covariance(self.pair.late, T_prev_cur)
         elif config.self_calibration:
@@ -353,12 +354,13 @@ class StereoOdometry:
                 of_depth=moves and not self.pair.unsharp,
                 twists=twists,
             )
-            otherwise = otherwise + learnt
+            otherwise, shared = otherwise + learnt, {CALIBRATION: learnt} if learnt.any() else {}
         return replace(
             record,
             T_prev_cur=T_prev_cur,
             covariances={m: c.full + otherwise for m, c in by_method.items()},
             v_t={m: c.v_t for m, c in by_method.items()},
+            shared=shared,
         )
 
     def _advance(

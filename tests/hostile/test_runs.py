@@ -20,7 +20,7 @@ from gpvo.errors import GpvoError, SourceError
 from gpvo.files import read_json, write_csv, write_json
 from gpvo.io.run import RunWriter, is_finished, read_run, write_run
 from gpvo.online.predictor import Predictor
-from gpvo.types import VoLog
+from gpvo.types import CALIBRATION, VoLog
 from synthetic_runs import make_run
 
 from command_line import gpvo
@@ -31,7 +31,9 @@ ESC = "\x1b[2J\x1b]0;owned\x07"
 
 @pytest.fixture(scope="module")
 def log() -> VoLog:
-    return make_run(50, n=30)[0]
+    log = make_run(50, n=30)[0]
+    share = 1e-9 * np.eye(6)
+    return replace(log, records=[replace(r, shared={CALIBRATION: share}) if r.usable else r for r in log])
 
 
 @pytest.fixture
@@ -85,6 +87,7 @@ def test_what_a_run_says_of_itself_is_held_against_its_kind(changed: dict, run: 
 @pytest.mark.parametrize(("column", "value"), [
     ("cov_pointing_matching_01", 1.0), ("cov_pointing_matching_00", np.nan), ("cov_pointing_matching_11", 0.0),
     ("cov_pointing_matching_11", -1.0), ("cov_pointing_matching_12", np.nan), ("cov_pointing_matching_33", np.inf),
+    ("shared_calibration_00", -1.0), ("shared_calibration_01", np.nan), ("shared_calibration_22", 1.0),
     ("p_x_m", np.nan), ("p_x_m", -1e200), ("R_00", 2.0), ("R_00", 1e300),
 ])  # fmt: skip
 def test_a_covariance_that_is_none_is_refused(column: str, value: float, run: Path) -> None:

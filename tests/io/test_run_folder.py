@@ -44,6 +44,8 @@ def make_records(n: int, seed: int = 0) -> list[VoRecord]:
     out = [VoRecord(start, start, Status.START, np.eye(4), stage_ms={"detect": 1.5})]
     for k in range(1, n):
         lost = k % 17 == 5
+        stated = {} if lost else {"triangulation": _spd(rng, 6), "pointing_matching": _spd(rng, 6)}
+        least = min((np.linalg.eigvalsh(C)[0] for C in stated.values()), default=0.0)
         imu = {} if k % 3 else {"imu_gyro_mean_radps": rng.normal(size=3), "imu_acc_std_mps2": rng.normal(size=3)}
         out.append(
             VoRecord(
@@ -55,8 +57,9 @@ def make_records(n: int, seed: int = 0) -> list[VoRecord]:
                 n_inliers=-1 if lost else int(rng.integers(10, 500)),
                 n_tracked=500,
                 reproj_rms_px=np.nan if lost else float(rng.uniform()),
-                covariances={} if lost else {"triangulation": _spd(rng, 6), "pointing_matching": _spd(rng, 6)},
+                covariances=stated,
                 v_t={} if lost else {"triangulation": _spd(rng, 3)},
+                shared={"calibration": 0.5 * least * np.eye(6)} if k % 7 and not lost else {},
                 stage_ms={"detect": float(rng.uniform()), "match": 2.0},
                 **imu,
             )
