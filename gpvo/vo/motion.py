@@ -8,7 +8,7 @@ Shafer, "Error modeling in stereo navigation", 1987, eq. 16).
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from functools import cached_property
 
 import numpy as np
@@ -23,6 +23,10 @@ from gpvo.vo.points import PointNoise
 # Quantiles of chi-square with 3 degrees of freedom.
 CHI2_3_MEDIAN = 2.366
 CHI2_3_999 = 16.266
+_OFF2 = 9.0  # squared residual of a point that may belong to another body
+_LEAST_APART = 8  # points of each: through a few, a motion is found by chance
+_APART = 0.8  # of the sum of squares: two motions through noise alone leave 0.82 to 0.9 on average
+_APART_MEMORY = 0.8  # of a motion
 
 
 @dataclass(frozen=True)
@@ -349,3 +353,35 @@ def _robust_weights(m2: Array, close: NDArray[np.bool_]) -> tuple[NDArray[np.boo
     scale2 = max(median(m2[close]) / CHI2_3_MEDIAN / freedom if close.any() else 1.0, 0.02**2)
     ratio = m2 / scale2
     return close & (ratio < CHI2_3_999), float(np.sqrt(scale2)), huber(ratio)
+
+
+@dataclass
+class Apart:
+    """Whether two bodies move in the image, by less than would make two motions of them: two motions then explain
+    their points far better than one does with any error of the rig. An error of the rig never does: what it leaves is
+    noise, whatever the depth. ``left`` (2,): running sums of squares, with two motions, and with an error of the rig.
+    """
+
+    left: Array = field(default_factory=lambda: np.zeros(2))
+
+    def see(self, A: Array, z: Array, by_rig: float) -> bool:
+        """Take in a motion: whitened derivatives (3 M, 6) by it and residuals (3 M,), coordinate by coordinate, of
+        which an error of the rig would leave this sum of squares; whether two bodies move."""
+        self.left = _APART_MEMORY * self.left + (min(_by_two(A, z), by_rig), by_rig)
+        return bool(self.left[0] < _APART * self.left[1])
+
+
+def _by_two(A: Array, z: Array) -> float:
+    """Sum of squares that two motions leave, each point with the one that suits it; infinite where there are none."""
+    parts, by_point = A.reshape(3, -1, 6), z.reshape(3, -1)
+    squares = np.zeros((2, by_point.shape[1]))
+    other = (by_point**2).sum(axis=0) > _OFF2
+    for _ in range(4):
+        if min(other.sum(), (~other).sum()) < _LEAST_APART:
+            return np.inf
+        for i, among in enumerate((~other, other)):
+            a, b = parts[:, among].reshape(-1, 6), by_point[:, among].reshape(-1)
+            step = np.linalg.lstsq(a.T @ a, a.T @ b, rcond=1e-12)[0]
+            squares[i] = ((by_point - parts @ step) ** 2).sum(axis=0)
+        other = squares[1] < squares[0]
+    return float(squares.min(axis=0).sum())

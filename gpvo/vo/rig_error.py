@@ -37,7 +37,7 @@ from numpy.typing import NDArray
 from gpvo.stats.series import median
 from gpvo.types import Array, StereoCamera
 from gpvo.vo.covariance import Blocks, Gaussians, Sums
-from gpvo.vo.motion import NO_TWIST, Motion, Whitened, apply_whitener, mistakable, right_velocity
+from gpvo.vo.motion import NO_TWIST, Apart, Motion, Whitened, apply_whitener, mistakable, right_velocity
 
 _HIGHEST = 4  # order
 POWERS = np.array([(n - j, j) for n in range(_HIGHEST + 1) for j in range(n + 1)])  # of x and y, order by order
@@ -145,7 +145,7 @@ class RigError:
             return
         precision = np.asarray(np.linalg.inv(self.state.covariance), np.float64)
         self._blocks = tuple(Blocks(precision[part]) for part in (_IN_DX, _IN_DY))
-        self._undisputed = 0  # motions since one was disputed
+        self._undisputed, self._apart = 0, Apart()  # motions since one was disputed; whether two bodies move
         self._motions, self._past = 0, deque[tuple[tuple[Sums, ...], RigState]](maxlen=_STEPS)
         covariances = [prior_covariance(camera, *kind) for kind in product(_MOUNTINGS, _LENSES, _ROLLS)]
         # A state from a file is no calibration to return to.
@@ -254,12 +254,12 @@ class RigError:
     def _learn_disparities(self, A: Array, B: Array, dilution: Array) -> None:
         """``A`` (n, 6), ``B`` (n, 17): whitened derivatives by the motion, by dx, and residuals; ``dilution`` (3, 3)
         of the translation's score, each column for another part of the noise."""
-        K = np.linalg.solve(A.T @ A, A.T @ B)
-        rest = B - A @ K
-        sums = rest.T @ rest
-        information = sums[:-1, :-1]
-        score = sums[:-1, -1] + information @ self.state.mean[_DX]
-        self._blocks[0].add(information, score, -K[:3, :-1].T @ dilution)
+        rest = B - A @ (K := np.linalg.solve(A.T @ A, A.T @ B))
+        information, score = (sums := rest.T @ rest)[:-1, :-1], sums[:-1, -1]
+        by_rig = float(sums[-1, -1] - score @ np.linalg.lstsq(information, score)[0])
+        if not self._apart.see(A, B[:, -1], by_rig):
+            score = score + information @ self.state.mean[_DX]
+            self._blocks[0].add(information, score, -K[:3, :-1].T @ dilution)
 
     def _learn_rows(self, by_dy: Array, row_error: Array) -> None:
         """``by_dy`` (16, M): derivatives by dy. Far points tell as much as near ones. Cameras that have moved displace

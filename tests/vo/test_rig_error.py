@@ -194,6 +194,28 @@ def test_a_lorry_that_sets_off_in_front_of_a_camera_at_rest_is_no_wrong_rig() ->
     assert max(off_px) < 0.5
 
 
+@pytest.mark.parametrize("person_mps", [(0.0, 0.0, -0.3), (0.0, 0.0, 0.3), (0.6, 0.0, 0.3)])
+def test_a_person_who_walks_beside_a_camera_that_moves_sideways_is_no_wrong_rig(
+    person_mps: tuple[float, float, float],
+) -> None:
+    """Moving sideways, a disparity is told from a turn by hardly anything; the person's motion is no second one yet."""
+    rng, velocity_mps = np.random.default_rng(5), np.zeros((500, 3))
+    room = rng.uniform([-4.0, -2.0, 2.5], [4.0, 2.0, 8.0], (360, 3))
+    points = np.concatenate([room, rng.uniform([-0.4, -0.9, 1.0], [0.4, 0.9, 2.0], (140, 3))])
+    velocity_mps[360:] = person_mps
+    odometry, off_px = StereoOdometry(CAMERA, VoConfig(max_acceleration_mps2=6.0)), []
+    for k in range(40):
+        seen = points + velocity_mps * max(0.05 * k - 0.5, 0.0) - [0.025 * k, 0.0, 0.0]
+        uvd = CAMERA.project(seen)
+        left, right = uvd[:, :2], uvd[:, :2] - uvd[:, 2:] * [1.0, 0.0]
+        inside = (seen[:, 2] > 0.4) & (left > 0).all(axis=1) & (left < [640, 480]).all(axis=1)
+        noise_px = rng.normal(0.0, 0.2, (2, len(uvd), 2))
+        ids = np.arange(len(uvd))[inside]
+        odometry.step(TrackFrame(50_000_000 * k, ids, (left + noise_px[0])[inside], (right + noise_px[1])[inside]))
+        off_px.append(float(np.abs(odometry.rig_error.errors(uvd[inside])[0]).max()))
+    assert max(off_px) < 0.3
+
+
 @pytest.mark.parametrize("sigma_px", [(0.12, 0.03), (0.03, 0.12)])
 def test_over_far_ground_with_edges_one_way_an_exact_rig_is_left_alone(sigma_px: tuple[float, float]) -> None:
     """Columns and rows of other noise than assumed, 30 m over a field with 0.6 m of relief: less than the noise shows.
