@@ -239,7 +239,7 @@ class StereoOdometry:
             doubts.append(f"two motions, over {covered[0]} and {covered[1]} parts of the image")
         elif state.remembers_rival:
             doubts.append("two motions in the frames before")
-        expected = state.expected(t_ns, self.config.max_acceleration_mps2)
+        expected = state.expected(t_ns, most_mps2 := self.config.max_acceleration_mps2)
         chosen = choose(motions, covered, expected, lambda i, on: state.unseen(shares[i], expected, goes_on=on))
         if len(motions) == 1 and chosen.plausible:  # a rival that is not found in one frame has not gone
             chosen = replace(chosen, otherwise=state.rival_stays * state.in_doubt)
@@ -252,13 +252,13 @@ class StereoOdometry:
             says = "the IMU felt no such change of velocity", "no vehicle changes its velocity like this"
             doubts.append(says[0] if is_felt else says[1])
         elif chosen.tells and not chosen.goes_on:
-            state.leap(t_ns, T_ref_cur, self.config.max_acceleration_mps2)
+            state.leap(t_ns, T_ref_cur, most_mps2)
         elif chosen.tells:
             state.compare(t_ns, T_ref_cur, motions[chosen.index].worst_translation_sigma_m)
         if chosen.plausible:
-            unseen = state.follow(t_ns, T_ref_cur, shares[chosen.index], expected, goes_on=chosen.goes_on)
+            unseen = state.follow(t_ns, T_ref_cur, shares[chosen.index], expected, most_mps2, goes_on=chosen.goes_on)
             chosen = replace(chosen, otherwise=chosen.otherwise + unseen)
-        left = state.otherwise(t_ns, T_ref_cur, self.config.max_acceleration_mps2)
+        left = state.otherwise(t_ns, T_ref_cur, most_mps2)
         if left is not None:
             doubts.append(state.leaps.reason)
             chosen = replace(chosen, otherwise=chosen.otherwise + left)

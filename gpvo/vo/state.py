@@ -173,7 +173,7 @@ class State:
         C_turn = step_s**2 * self.standing.unseen(self.twist)[3:, 3:]
         expected = Expected(T_same, reach_mps * step_s + jitter_m, sigma_m, self.odds, C_turn, T_refused)
         if self.leaps.before is not None and self.leaps.contradicted:
-            left_reach_mps = _SIGMAS_WITHIN_REACH * self._sigma_before_mps(t_ns, max_acceleration_mps2)
+            left_reach_mps = _SIGMAS_WITHIN_REACH * self._sigma_left_mps(t_ns, max_acceleration_mps2)
             if self.leaps.differs(self.twist, left_reach_mps):
                 T_left = self.T_ref_believed @ se3.exp(self.leaps.before * step_s)
                 expected = replace(expected, T_left=T_left, left_reach_m=left_reach_mps * step_s)
@@ -196,7 +196,7 @@ class State:
         last = self.twist
         if self.felt is not None and self.felt.is_known:
             last = np.concatenate([self.felt.expected(), last[3:]])
-        reach_mps = _SIGMAS_WITHIN_REACH * self._sigma_before_mps(t_ns, max_acceleration_mps2)
+        reach_mps = _SIGMAS_WITHIN_REACH * self._sigma_left_mps(t_ns, max_acceleration_mps2)
         self.leaps.step(t_ns, self._velocity(t_ns, T_ref_cur), last, self.t_twist_ns, reach_mps)
         self.refused = None
 
@@ -230,14 +230,23 @@ class State:
         felt = self.felt.proven if agrees and self.felt is not None else 0.0
         return 0.5 * self.standing.wrong(share, goes_on=goes_on, felt=felt)
 
-    def follow(self, t_ns: int, T_ref_cur: Array, share: float, expected: Expected | None, *, goes_on: bool) -> Array:
+    def follow(
+        self, t_ns: int, T_ref_cur: Array, share: float, expected: Expected | None, max_acceleration_mps2: float, *,
+        goes_on: bool,
+    ) -> Array:  # fmt: skip
         """The motion from the reference explains this share of the image and is taken; covariance (6, 6) of the scene's
-        being none that was seen."""
+        being none that was seen, or, beside a rival, one that was refused."""
         twist = self._velocity(t_ns, T_ref_cur)
         step_s, dt_s = ((t_ns - since) * 1e-9 for since in (self.t_believed_ns, self.t_ref_ns))
         has_doubt = share < EXPLAINED and self.has_rival
         wrong = self.unseen(share, expected, goes_on=goes_on) if has_doubt else 0.0
         C = wrong * dt_s**2 * self.standing.unseen(twist)
+        if self.refused is not None and (self.rival is not None or self.remembers_rival):
+            # An IMU that felt changes of velocity wrongly carries a velocity on wrongly.
+            wrongly = 1.0 if self.felt is None else 1.0 - self.felt.proven
+            sigmas_mps = self._sigmas_since_mps(self.t_refused_ns, t_ns, max_acceleration_mps2)
+            was = self._instead(t_ns, T_ref_cur, self.refused, max(wrongly * sigmas_mps[0], min(sigmas_mps)))
+            C = C + was / (1.0 + np.exp(self.odds))
         self.standing.follow(share, twist, step_s, goes_on=goes_on)
         return C
 
@@ -247,18 +256,26 @@ class State:
         before = self.leaps.doubted(t_ns, hidden=self.hidden)
         if before is None:
             return None
-        dt_s = (t_ns - self.t_ref_ns) * 1e-9
-        d = se3.log(se3.inverse(T_ref_cur) @ se3.exp(before * dt_s))
-        sigma_m = self._sigma_before_mps(t_ns, max_acceleration_mps2) * dt_s
-        C = np.outer(d, d) + np.diag([sigma_m**2] * 3 + [0.0] * 3)
-        C[3:, 3:] += dt_s**2 * self.standing.unseen(before)[3:, 3:]
-        return 0.5 * C
+        return 0.5 * self._instead(t_ns, T_ref_cur, before, self._sigma_left_mps(t_ns, max_acceleration_mps2))
 
-    def _sigma_before_mps(self, t_ns: int, max_acceleration_mps2: float) -> float:
+    def _instead(self, t_ns: int, T_ref_cur: Array, twist: Array, sigma_mps: float) -> Array:
+        """Second moment (6, 6) about the motion from the reference of that at another velocity (6,), known to
+        ``sigma_mps`` on each axis."""
+        dt_s = (t_ns - self.t_ref_ns) * 1e-9
+        d = se3.log(se3.inverse(T_ref_cur) @ se3.exp(twist * dt_s))
+        C = np.outer(d, d) + np.diag([(sigma_mps * dt_s) ** 2] * 3 + [0.0] * 3)
+        C[3:, 3:] += dt_s**2 * self.standing.unseen(twist)[3:, 3:]
+        return C
+
+    def _sigma_left_mps(self, t_ns: int, max_acceleration_mps2: float) -> float:
         """Standard deviation, on each axis, of the velocity before the leap, carried on to ``t_ns``."""
-        age_s = (t_ns - self.leaps.left_ns) * 1e-9
-        vehicle_mps = max_acceleration_mps2 * age_s / _SIGMAS_WITHIN_REACH
-        return vehicle_mps if self.felt is None else min(vehicle_mps, self.felt.sigma_mps(age_s))
+        return min(self._sigmas_since_mps(self.leaps.left_ns, t_ns, max_acceleration_mps2))
+
+    def _sigmas_since_mps(self, since_ns: int, t_ns: int, max_acceleration_mps2: float) -> tuple[float, float]:
+        """The same of a velocity measured last at ``since_ns``: by what a vehicle can do, and by what the IMU felt."""
+        age_s = (t_ns - since_ns) * 1e-9
+        felt_mps = np.inf if self.felt is None else self.felt.sigma_mps(age_s)
+        return max_acceleration_mps2 * age_s / _SIGMAS_WITHIN_REACH, felt_mps
 
     @property
     def _lag_s(self) -> float:

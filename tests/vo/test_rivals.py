@@ -70,6 +70,20 @@ def test_a_velocity_that_is_not_seen_is_known_no_better_in_its_turn():
     assert otherwise[4, 4] > 0.5 * (0.1 * 8.1) ** 2 * 0.9  # as one of which no turn is known may turn
 
 
+def test_beside_a_rival_a_velocity_that_was_refused_may_be_the_scene_s():
+    """A lorry's velocity is believed; the street came back for one frame, and no vehicle could have reached it."""
+    seconds, street = 10**9, np.array([0.0, 0.0, 20.0, 0.0, 0.0, 0.0])
+    state = State.begin(0, 100, None)
+    state.odds, state.refused, state.t_refused_ns = 3.0, street, 8 * seconds
+    state.t_ref_ns = state.t_believed_ns = 82 * seconds // 10
+    assert not state.follow(83 * seconds // 10, np.eye(4), 0.9, None, 12.0, goes_on=True).any()
+    state.rivalry = 1.5
+    C = state.follow(83 * seconds // 10, np.eye(4), 0.9, None, 12.0, goes_on=True)
+    error = np.array([0.0, 0.02, -1.8, 0.0, 0.006, 0.0])  # the street's velocity now, which is not quite that of then
+    assert error[:3] @ np.linalg.solve(C[:3, :3], error[:3]) < 25.0
+    assert np.sqrt(C[4, 4]) > 0.2 * 0.1 * 0.1
+
+
 def test_a_leap_is_in_doubt_until_one_leads_back_or_it_has_lasted_as_long():
     """From 15 m/s on to a lorry's 0.5 m/s after 8 s, and off it again by a car of 12 m/s^2."""
     seconds, before, lorry = 10**9, np.array([0, 0, 15.0, 0, 0, 0]), np.array([0, 0, 0.5, 0, 0, 0])
