@@ -359,29 +359,37 @@ def _robust_weights(m2: Array, close: NDArray[np.bool_]) -> tuple[NDArray[np.boo
 class Apart:
     """Whether two bodies move in the image, by less than would make two motions of them: two motions then explain
     their points far better than one does with any error of the rig. An error of the rig never does: what it leaves is
-    noise, whatever the depth. ``left`` (2,): running sums of squares, with two motions, and with an error of the rig.
+    noise, whatever the depth. Either may be the scene's.
+
+    ``left`` (2,): running sums of squares, with two motions, and with an error of the rig. ``otherwise`` (6, 6): second
+    moment of the two about the last motion, each by its share of the points; zero where no two bodies move.
     """
 
     left: Array = field(default_factory=lambda: np.zeros(2))
+    otherwise: Array = field(default_factory=lambda: np.zeros((6, 6)))
 
     def see(self, A: Array, z: Array, by_rig: float) -> bool:
         """Take in a motion: whitened derivatives (3 M, 6) by it and residuals (3 M,), coordinate by coordinate, of
         which an error of the rig would leave this sum of squares; whether two bodies move."""
-        self.left = _APART_MEMORY * self.left + (min(_by_two(A, z), by_rig), by_rig)
-        return bool(self.left[0] < _APART * self.left[1])
+        by_two, moment = _by_two(A.reshape(3, -1, 6), z.reshape(3, -1))
+        self.left = _APART_MEMORY * self.left + (min(by_two, by_rig), by_rig)
+        is_apart = bool(self.left[0] < _APART * self.left[1])
+        self.otherwise = moment if is_apart else np.zeros((6, 6))
+        return is_apart
 
 
-def _by_two(A: Array, z: Array) -> float:
-    """Sum of squares that two motions leave, each point with the one that suits it; infinite where there are none."""
-    parts, by_point = A.reshape(3, -1, 6), z.reshape(3, -1)
-    squares = np.zeros((2, by_point.shape[1]))
-    other = (by_point**2).sum(axis=0) > _OFF2
+def _by_two(A: Array, z: Array) -> tuple[float, Array]:
+    """Sum of squares that two motions leave of residuals (3, M) with derivatives (3, M, 6), each point with the one
+    that suits it, infinite where there are none; second moment (6, 6) of the two."""
+    squares, steps = np.zeros((2, z.shape[1])), np.zeros((2, 6))
+    other = (z**2).sum(axis=0) > _OFF2
     for _ in range(4):
         if min(other.sum(), (~other).sum()) < _LEAST_APART:
-            return np.inf
+            return np.inf, np.zeros((6, 6))
         for i, among in enumerate((~other, other)):
-            a, b = parts[:, among].reshape(-1, 6), by_point[:, among].reshape(-1)
-            step = np.linalg.lstsq(a.T @ a, a.T @ b, rcond=1e-12)[0]
-            squares[i] = ((by_point - parts @ step) ** 2).sum(axis=0)
+            a, b = A[:, among].reshape(-1, 6), z[:, among].reshape(-1)
+            steps[i] = np.linalg.lstsq(a.T @ a, a.T @ b, rcond=1e-12)[0]
+            squares[i] = ((z - A @ steps[i]) ** 2).sum(axis=0)
         other = squares[1] < squares[0]
-    return float(squares.min(axis=0).sum())
+    share = other.mean()
+    return float(squares.min(axis=0).sum()), steps.T @ ([[1.0 - share], [share]] * steps)

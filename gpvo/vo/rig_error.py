@@ -218,7 +218,7 @@ class RigError:
 
         Returns
         -------
-        (6, 6) covariance that the state before this motion adds to it: ``K P K^T``, K the motion's derivative by dx.
+        (6, 6) covariance to add: ``K P K^T`` of the state before, K the motion's derivative by dx; that of two bodies.
         """
         fx, moved, scale_px = self._camera.fx_px, white.moved, max(motion.scale_px, 0.1)
         z = white.z / scale_px
@@ -245,21 +245,21 @@ class RigError:
                 mistaken = (apply_whitener(white.W, q) * by_d for q in mistakable(motion, white))
                 dilution = np.stack([(by_motion[:, :3] * q[:, None])[..., near].sum((0, 2)) for q in mistaken], axis=1)
                 of_near = np.tile(near, 3)
-                self._learn_disparities(A[of_near], B[of_near], dilution)
+                added += self._learn_disparities(A[of_near], B[of_near], dilution)
             by_dy, of = (phi, row_error) if displaced is None else (self._terms(displaced[0], twists[1]), displaced[1])
             self._learn_rows(by_dy[1], of)
             self._conclude()
         return added
 
-    def _learn_disparities(self, A: Array, B: Array, dilution: Array) -> None:
+    def _learn_disparities(self, A: Array, B: Array, dilution: Array) -> Array:
         """``A`` (n, 6), ``B`` (n, 17): whitened derivatives by the motion, by dx, and residuals; ``dilution`` (3, 3)
-        of the translation's score, each column for another part of the noise."""
+        of the translation's score, each column for another part of the noise. Covariance (6, 6) of two bodies."""
         rest = B - A @ (K := np.linalg.solve(A.T @ A, A.T @ B))
         information, score = (sums := rest.T @ rest)[:-1, :-1], sums[:-1, -1]
         by_rig = float(sums[-1, -1] - score @ np.linalg.lstsq(information, score)[0])
         if not self._apart.see(A, B[:, -1], by_rig):
-            score = score + information @ self.state.mean[_DX]
-            self._blocks[0].add(information, score, -K[:3, :-1].T @ dilution)
+            self._blocks[0].add(information, score + information @ self.state.mean[_DX], -K[:3, :-1].T @ dilution)
+        return self._apart.otherwise
 
     def _learn_rows(self, by_dy: Array, row_error: Array) -> None:
         """``by_dy`` (16, M): derivatives by dy. Far points tell as much as near ones. Cameras that have moved displace

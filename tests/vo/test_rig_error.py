@@ -203,7 +203,7 @@ def test_a_person_who_walks_beside_a_camera_that_moves_sideways_is_no_wrong_rig(
     room = rng.uniform([-4.0, -2.0, 2.5], [4.0, 2.0, 8.0], (360, 3))
     points = np.concatenate([room, rng.uniform([-0.4, -0.9, 1.0], [0.4, 0.9, 2.0], (140, 3))])
     velocity_mps[360:] = person_mps
-    odometry, off_px = StereoOdometry(CAMERA, VoConfig(max_acceleration_mps2=6.0)), []
+    odometry, off_px, beyond = StereoOdometry(CAMERA, VoConfig(max_acceleration_mps2=6.0)), [], []
     for k in range(40):
         seen = points + velocity_mps * max(0.05 * k - 0.5, 0.0) - [0.025 * k, 0.0, 0.0]
         uvd = CAMERA.project(seen)
@@ -211,9 +211,15 @@ def test_a_person_who_walks_beside_a_camera_that_moves_sideways_is_no_wrong_rig(
         inside = (seen[:, 2] > 0.4) & (left > 0).all(axis=1) & (left < [640, 480]).all(axis=1)
         noise_px = rng.normal(0.0, 0.2, (2, len(uvd), 2))
         ids = np.arange(len(uvd))[inside]
-        odometry.step(TrackFrame(50_000_000 * k, ids, (left + noise_px[0])[inside], (right + noise_px[1])[inside]))
+        frame = TrackFrame(50_000_000 * k, ids, (left + noise_px[0])[inside], (right + noise_px[1])[inside])
+        record = odometry.step(frame)
         off_px.append(float(np.abs(odometry.rig_error.errors(uvd[inside])[0]).max()))
+        if k > 12:  # three motions on, two bodies are known to move
+            error_m = record.T_prev_cur[:3, 3] - [0.5e-9 * (record.t_ns - record.t_prev_ns), 0.0, 0.0]
+            C = record.covariances["pointing_matching"][:3, :3]
+            beyond.append(error_m @ np.linalg.solve(C, error_m) > 25.0)
     assert max(off_px) < 0.3
+    assert np.mean(beyond) < 0.2
 
 
 @pytest.mark.parametrize("sigma_px", [(0.12, 0.03), (0.03, 0.12)])
