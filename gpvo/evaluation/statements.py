@@ -85,8 +85,9 @@ def _simple(log: VoLog, arrays: Mapping[str, Any], name: str) -> Statement:
     elif name != method and not is_vt:
         # The scale was fitted to measured motions; what is said of a lost one is no pixel noise and stands.
         C = np.where(log.usable[:, None, None], C, stated[method])
-    shared = simple_covariances(arrays, {method: log.shared_by_all}, {}, len(log)).get(name)
-    return plain_statement(log, name, C, shared if method in log.methods else None)
+    if is_vt or name == "constant" or not log.causes:
+        return plain_statement(log, name, C)
+    return plain_statement(log, name, C, simple_covariances(arrays, {method: log.shared_by_all}, {}, len(log))[name])
 
 
 def _frames_bridged(log: VoLog) -> Array:
@@ -113,7 +114,8 @@ def plain_statement(log: VoLog, method: str, covariance: Array, shared: Array | 
         return Statement(method, mean, covariance, None)
     # A motion that nobody vouches for enters the sum with what was said of the one before.
     usable, vouched = log.usable, np.where(np.isfinite(covariance).all(axis=(1, 2)), np.arange(len(log)), -1)
-    source, dt_s, T = np.maximum.accumulate(vouched), log.column("dt_s"), log.T_prev_cur
+    source, dt_s = np.maximum.accumulate(vouched), log.column("dt_s")
+    T = np.zeros((0, 4, 4)) if shared is None else log.T_prev_cur
 
     def held(k: int) -> MotionError:
         C = _NOTHING if source[k] < 0 else covariance[source[k]]

@@ -344,7 +344,7 @@ class StereoOdometry:
             # An image at rest says nothing of depth, but with a wrong rig, what begins to move slowly fits one motion
             # with what stays. Other doubts may come from the rig's own errors, which only learning ends.
             moves = parallax_px >= config.keyframe_parallax_px
-            learnt = self.rig_error.update(
+            common, of_bodies = self.rig_error.update(
                 motion,
                 white,
                 row_error,
@@ -354,7 +354,8 @@ class StereoOdometry:
                 of_depth=moves and not self.pair.unsharp,
                 twists=twists,
             )
-            otherwise, shared = otherwise + learnt, {CALIBRATION: learnt} if learnt.any() else {}
+            shared = {CALIBRATION: common} if common.any() else {}
+            otherwise = otherwise + common + of_bodies
         return replace(
             record,
             T_prev_cur=T_prev_cur,

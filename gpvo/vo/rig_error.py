@@ -210,7 +210,7 @@ class RigError:
         disputed: bool = False,
         of_depth: bool = True,
         twists: tuple[Array, Array] = (NO_TWIST, NO_TWIST),
-    ) -> Array:
+    ) -> tuple[Array, Array]:
         """Learn from a motion over corrected measurements and its whitened residuals; its inliers have these row errors
         (M,), which do not count where all points of the image are ``displaced``. Where the images tell nothing
         ``of_depth``, it teaches rows alone: what disparities teach lasts. ``disputed``: another motion may be that of
@@ -218,7 +218,8 @@ class RigError:
 
         Returns
         -------
-        (6, 6) covariance to add: ``K P K^T`` of the state before, K the motion's derivative by dx; that of two bodies.
+        Covariances (6, 6) to add: ``K P K^T`` of the state before, K the motion's derivative by dx, which all motions
+        share; and that of two bodies.
         """
         fx, moved, scale_px = self._camera.fx_px, white.moved, max(motion.scale_px, 0.1)
         z = white.z / scale_px
@@ -235,6 +236,7 @@ class RigError:
         B = np.column_stack([B.transpose(0, 2, 1).reshape(-1, _N), (z * root).reshape(-1)])
         K = np.linalg.solve(A.T @ A, A.T @ B[:, :-1])
         added: Array = K @ self.state.covariance[_IN_DX] @ K.T
+        of_bodies: Array = np.zeros((6, 6))
         if self._learn and self._lasts(displaced is not None):
             self._undisputed = 0 if disputed else self._undisputed + 1
             sigma_px = motion.scale_px * np.sqrt(1.0 + motion.noise.persistent)
@@ -245,11 +247,11 @@ class RigError:
                 mistaken = (apply_whitener(white.W, q) * by_d for q in mistakable(motion, white))
                 dilution = np.stack([(by_motion[:, :3] * q[:, None])[..., near].sum((0, 2)) for q in mistaken], axis=1)
                 of_near = np.tile(near, 3)
-                added += self._learn_disparities(A[of_near], B[of_near], dilution)
+                of_bodies = self._learn_disparities(A[of_near], B[of_near], dilution)
             by_dy, of = (phi, row_error) if displaced is None else (self._terms(displaced[0], twists[1]), displaced[1])
             self._learn_rows(by_dy[1], of)
             self._conclude()
-        return added
+        return added, of_bodies
 
     def _learn_disparities(self, A: Array, B: Array, dilution: Array) -> Array:
         """``A`` (n, 6), ``B`` (n, 17): whitened derivatives by the motion, by dx, and residuals; ``dilution`` (3, 3)
