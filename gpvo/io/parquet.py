@@ -62,14 +62,12 @@ class RowGroup:
     place: NDArray[np.int64]
 
 
-def write_table(
-    path: Path, columns: Mapping[str, Any], metadata: Mapping[str, str] | None = None, own: Own | None = None
-) -> RowGroup:
+def write_table(path: Path, columns: Mapping[str, Any], metadata: Mapping[str, str] | None = None) -> RowGroup:
     """Write columns of one length in place of what was there, or not at all. None and NaN become null.
 
     Raises OutputError, naming ``path``, as :func:`gpvo.files.replacing`.
     """
-    return write_blocks(path, [columns], metadata, own)
+    return write_blocks(path, [columns], metadata)
 
 
 def write_blocks(
@@ -129,18 +127,15 @@ def join_tables(parts: Sequence[RowGroup], target: Path, metadata: Mapping[str, 
 def _stored_page(stored: bytes, place: NDArray[np.int64] | None, rows: int, name: str) -> tuple[bytes, int]:
     """A column's page in a stored table, of nulls where it has none, and its size before compression."""
     if place is None:
-        return _page([None] * rows, KIND_OF.get(name, "float64"))
+        kind = KIND_OF.get(name, "float64")
+        return _packed(*_encoded([None] * rows, kind), kind)
     offset, size, plain = place.tolist()
     return stored[offset : offset + size], plain
 
 
-def _page(values: Any, kind: str) -> tuple[bytes, int]:
-    """A column's page with its header, and its size before compression."""
-    return _packed(*_encoded(values, kind), kind)
-
-
 def _packed(present: NDArray[np.bool_], data: bytes | bytearray, kind: str) -> tuple[bytes, int]:
-    """The page of the values that there are, as :func:`_encoded` gives them."""
+    """The page, with its header, of the values that there are, as :func:`_encoded` gives them; and its size before
+    compression."""
     if kind == "bool":
         data = np.packbits(np.frombuffer(data, dtype=bool), bitorder="little").tobytes()
     levels = _varint(((len(present) + 7) // 8) << 1 | 1) + np.packbits(present, bitorder="little").tobytes()
