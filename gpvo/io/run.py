@@ -28,7 +28,8 @@ from gpvo.geometry.covariance import are_covariances, from_upper, upper
 from gpvo.io import run_folder, run_table
 from gpvo.io.parquet import RowGroup, join_tables, write_blocks, write_table
 from gpvo.io.run_folder import is_finished
-from gpvo.io.run_read import SCHEMA, Run, read_predictions, read_run, read_tracks, table_of
+from gpvo.io.run_read import Run, read_predictions, read_run, read_tracks, table_of
+from gpvo.io.run_table import SCHEMA
 from gpvo.io.snapshot import save_snapshot
 from gpvo.io.trajectory import tum_line
 from gpvo.types import Array, ImuLog, Mounting, Prediction, StereoCamera, StereoTracks, TruthLog, VoLog, VoRecord
@@ -102,9 +103,9 @@ class RunWriter:
             rig = {"camera": camera and asdict(camera), **vars(place), "calibration": calibration}
             write_json(self.path / "rig.json", {"schema": SCHEMA, **rig})
             if truth is not None:
-                run_folder.write_truth(self.path / "truth.parquet", truth)
+                write_table(self.path / "truth.parquet", *run_table.truth_table(truth))
             if imu is not None:
-                run_folder.write_imu(self.path / "imu.parquet", imu)
+                write_table(self.path / "imu.parquet", *run_table.imu_table(imu))
             write_toml(self.path / "config.toml", dict(config or {}))
         except BaseException:
             self._release()
@@ -266,7 +267,7 @@ def copy_run(
             run_folder.prepare(folder, keep_chunks=False)
         for file in (f for name in run_folder.OWN if (f := run.path / name).is_file()):
             shutil.copyfile(file, new / file.name)
-        run_folder.write_truth(new / "truth.parquet", truth)
+        write_table(new / "truth.parquet", *run_table.truth_table(truth))
         digests = run.meta.get("digests") or {}
         digests = digests | {"truth.parquet": digest_of_file(new / "truth.parquet")}
         write_json(new / "run.json", {**run.meta, "name": target.name, **(meta or {}), "digests": digests})

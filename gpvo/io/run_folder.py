@@ -3,22 +3,21 @@
 from __future__ import annotations
 
 import ctypes
-import json
 import os
 import shutil
 import sys
 from contextlib import suppress
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 from gpvo.errors import OutputError, SourceError
 from gpvo.files import FolderLock, make_folder, read_json
 from gpvo.io import run_table
-from gpvo.io.parquet import RowGroup, placed_columns, read_columns, write_table
-from gpvo.io.run_read import SCHEMA, check_log
+from gpvo.io.parquet import RowGroup, placed_columns, read_columns
+from gpvo.io.run_read import check_log
 from gpvo.io.snapshot import load_snapshot
-from gpvo.types import ImuLog, StoredRecords, TruthLog, VoLog
+from gpvo.types import StoredRecords, VoLog
 
 FILES = (
     "vo_log.parquet", "trajectory.tum", "rig.json", "truth.parquet", "imu.parquet", "predictions.parquet",
@@ -131,21 +130,3 @@ def prepare(path: Path, *, keep_chunks: bool) -> None:
         clear(path, keep_chunks=keep_chunks)
     except OSError as error:
         raise OutputError(f"cannot be written: {error.strerror}", where=path) from None
-
-
-def write_truth(path: Path, truth: TruthLog) -> None:
-    """Write ``truth.parquet``."""
-    metadata = {
-        "schema": str(SCHEMA),
-        "sigma_translation_m": repr(float(truth.sigma_translation_m)),
-        "sigma_rotation_rad": repr(float(truth.sigma_rotation_rad)),
-    }
-    write_table(path, run_table.truth_columns(truth), metadata)
-
-
-def write_imu(path: Path, imu: ImuLog) -> None:
-    """Write ``imu.parquet``."""
-    metadata = {"schema": str(SCHEMA)}
-    if imu.noise is not None:
-        metadata["noise"] = json.dumps(asdict(imu.noise))
-    write_table(path, run_table.imu_columns(imu), metadata)

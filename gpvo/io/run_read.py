@@ -2,11 +2,10 @@
 
 from __future__ import annotations
 
-import json
 import re
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, TypeVar
 
@@ -18,11 +17,11 @@ from gpvo.files import read_json, read_toml
 from gpvo.geometry.covariance import LARGEST, are_semidefinite, variances
 from gpvo.io import run_table
 from gpvo.io.parquet import count_rows, read_blocks, read_columns
+from gpvo.io.run_table import SCHEMA
 from gpvo.types import (
     Array,
     ByStamp,
     ImuLog,
-    ImuNoise,
     Mounting,
     Prediction,
     StereoCamera,
@@ -37,7 +36,7 @@ from gpvo.types import (
 
 T = TypeVar("T")
 
-SCHEMA, _AT_ONCE = 1, 5_000
+_AT_ONCE = 5_000
 _MAKE = "make one with 'gpvo run' of images, or 'gpvo import' of poses"
 _LARGEST = 1e12  # No mean or variance that a model states is larger [m, rad, m^2, rad^2].
 
@@ -101,7 +100,7 @@ def read_run(path: str | Path | Run) -> Run:
         name=_file_name(meta.get("name")) or _file_name(p.resolve().name),
         log=log,
         truth=_read_truth(p / "truth.parquet"),
-        imu=_read_imu(p / "imu.parquet"),
+        imu=_read_beside(p / "imu.parquet", run_table.imu_from),
         mounting=mounting,
         predictions=StoredPredictions.join(stated) if stated else [],
         meta=meta,
@@ -313,34 +312,18 @@ def _read_rig(path: Path) -> tuple[StereoCamera | None, Mounting]:
 
 
 def _read_truth(path: Path) -> TruthLog | None:
-    if not path.is_file():
-        return None
-    columns, metadata = read_columns(path)
-    with _guarded(path):
-        t, T = _stamps(columns), run_table.poses_from(columns)
-        _check_poses(T, path)
-        sigma_t, sigma_r = (float(metadata.get(k, 0.0)) for k in ("sigma_translation_m", "sigma_rotation_rad"))
-        v_world = run_table.velocity_from(columns)
-        if v_world is not None and not np.isfinite(v_world).all():
+    truth = _read_beside(path, run_table.truth_from)
+    if truth is not None:
+        _check_poses(truth.T_world_cam, path)
+        if truth.v_world_mps is not None and not np.isfinite(truth.v_world_mps).all():
             raise SourceError("holds a velocity that is not finite", where=path)
-        return TruthLog(t, T, sigma_t, sigma_r, v_world)
+    return truth
 
 
-def _read_imu(path: Path) -> ImuLog | None:
+def _read_beside(path: Path, made: Callable[[dict[str, NDArray[Any]], dict[str, str]], T]) -> T | None:
+    """What was recorded beside the motions; None where nothing was."""
     if not path.is_file():
         return None
     columns, metadata = read_columns(path)
     with _guarded(path):
-        _stamps(columns)
-        raw = run_table.imu_from(columns)
-        if "noise" not in metadata:
-            return raw
-        numbers = json.loads(metadata["noise"])
-        return replace(raw, noise=ImuNoise(**{k: float(numbers[k]) for k in field_names(ImuNoise)}))
-
-
-def _stamps(columns: dict[str, NDArray[Any]]) -> NDArray[np.int64]:
-    t = np.asarray(columns["t_ns"], dtype=np.int64)
-    if (np.diff(t) <= 0).any():
-        raise ValueError("stamps do not increase")
-    return t
+        return made(columns, metadata)

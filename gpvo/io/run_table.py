@@ -9,8 +9,10 @@ for x, y, z [m] and the rotations about x, y, z [rad]; ``vt_<method>_<i><j>`` is
 
 from __future__ import annotations
 
+import json
 import re
 from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import asdict
 from itertools import chain
 from typing import Any
 
@@ -25,6 +27,7 @@ from gpvo.types import (
     IMU_FIELDS,
     Array,
     ImuLog,
+    ImuNoise,
     Prediction,
     Status,
     StereoTracks,
@@ -33,8 +36,10 @@ from gpvo.types import (
     TruthLog,
     VoLog,
     VoRecord,
+    field_names,
 )
 
+SCHEMA = 1
 Columns = dict[str, Any]
 
 _AXES = ("x", "y", "z")
@@ -46,6 +51,7 @@ _IMU = {name: "{}_{{}}_{}".format(*name.rsplit("_", 1)) for name in IMU_FIELDS}
 _ALL6 = tuple((i, j) for i in range(6) for j in range(6))
 _METHOD = re.compile(r"(cov|vt|shared)_([A-Za-z][A-Za-z0-9_]*)_00")
 _VELOCITY, _GYRO, _ACC = (tuple(p.format(a) for a in _AXES) for p in ("v_{}_mps", "gyro_{}_radps", "acc_{}_mps2"))
+_NOISE = ("sigma_translation_m", "sigma_rotation_rad")
 _SIGMA6 = tuple(f"{a}_m" for a in _AXES) + tuple(f"r{a}_rad" for a in _AXES)
 _SHORT6 = tuple(a.rsplit("_", 1)[0] for a in _SIGMA6)
 
@@ -211,28 +217,40 @@ COLUMNS_OF: dict[str, Callable[[Any], Columns]] = {
 """By kind, how rows of the tables that are written in chunks become columns."""
 
 
-def truth_columns(truth: TruthLog) -> dict[str, NDArray[Any]]:
-    """Truth as columns."""
+def truth_table(truth: TruthLog) -> tuple[Columns, dict[str, str]]:
+    """Truth as columns, and its noise as their file's metadata."""
     out = {"t_ns": truth.t_ns, **pose_columns(truth.T_world_cam)}
     if truth.v_world_mps is not None:
         out |= dict(zip(_VELOCITY, truth.v_world_mps.T))
-    return out
+    return out, {"schema": str(SCHEMA), **{name: repr(float(getattr(truth, name))) for name in _NOISE}}
 
 
-def velocity_from(columns: Mapping[str, NDArray[Any]]) -> Array | None:
-    """Velocities of :func:`truth_columns`, None where there are none."""
-    return _stacked(columns, _VELOCITY) if columns.keys() >= set(_VELOCITY) else None
+def truth_from(columns: Mapping[str, NDArray[Any]], metadata: Mapping[str, str]) -> TruthLog:
+    """Truth of :func:`truth_table`."""
+    sigma_t, sigma_r = (float(metadata.get(name, 0.0)) for name in _NOISE)
+    v_world = _stacked(columns, _VELOCITY) if columns.keys() >= set(_VELOCITY) else None
+    return TruthLog(_stamps(columns), poses_from(columns), sigma_t, sigma_r, v_world)
 
 
-def imu_columns(imu: ImuLog) -> dict[str, NDArray[Any]]:
-    """IMU samples as columns."""
-    return {"t_ns": imu.t_ns, **dict(zip(_GYRO, imu.gyro_radps.T)), **dict(zip(_ACC, imu.acc_mps2.T))}
+def imu_table(imu: ImuLog) -> tuple[Columns, dict[str, str]]:
+    """IMU samples as columns, and their noise, if it is known, as their file's metadata."""
+    noise = {} if imu.noise is None else {"noise": json.dumps(asdict(imu.noise))}
+    samples = zip((*_GYRO, *_ACC), (*imu.gyro_radps.T, *imu.acc_mps2.T))
+    return {"t_ns": imu.t_ns, **dict(samples)}, {"schema": str(SCHEMA), **noise}
 
 
-def imu_from(columns: Mapping[str, NDArray[Any]]) -> ImuLog:
-    """IMU samples of :func:`imu_columns`, without their noise."""
-    t_ns = np.asarray(columns["t_ns"], dtype=np.int64)
-    return ImuLog(t_ns=t_ns, gyro_radps=_stacked(columns, _GYRO), acc_mps2=_stacked(columns, _ACC))
+def imu_from(columns: Mapping[str, NDArray[Any]], metadata: Mapping[str, str]) -> ImuLog:
+    """IMU samples of :func:`imu_table`."""
+    known = json.loads(metadata.get("noise", "null"))
+    noise = None if known is None else ImuNoise(**{name: float(known[name]) for name in field_names(ImuNoise)})
+    return ImuLog(_stamps(columns), _stacked(columns, _GYRO), _stacked(columns, _ACC), noise)
+
+
+def _stamps(columns: Mapping[str, NDArray[Any]]) -> NDArray[np.int64]:
+    t = np.asarray(columns["t_ns"], dtype=np.int64)
+    if (np.diff(t) <= 0).any():
+        raise ValueError("stamps do not increase")
+    return t
 
 
 def _stacked(columns: Mapping[str, NDArray[Any]], names: Iterable[str]) -> Array:

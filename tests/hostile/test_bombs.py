@@ -38,7 +38,8 @@ from gpvo.io.folder import FolderSource
 from gpvo.io.foreign import read_foreign
 from gpvo.io.images import read_grey8
 from gpvo.io.parquet import count_rows, join_tables, read_blocks, read_columns, write_table
-from gpvo.io.run_read import _read_imu
+from gpvo.io.run_read import _read_beside
+from gpvo.io.run_table import imu_from
 from gpvo.io.tracks import TracksSource
 from gpvo.io.trajectory import read_tum
 from gpvo.online.predictor import Predictor
@@ -233,7 +234,7 @@ def test_text_in_the_place_of_numbers_is_refused(tmp_path: Path) -> None:
     columns = {f"{k}_{a}_{u}": ["x", "y"] for k, u in (("gyro", "radps"), ("acc", "mps2")) for a in "xyz"}
     pq.write_table(pa.table({"t_ns": [1, 2], **columns}), tmp_path / "imu.parquet")
     with pytest.raises(SourceError, match=r"imu\.parquet.*holds string"):
-        _read_imu(tmp_path / "imu.parquet")
+        _read_beside(tmp_path / "imu.parquet", imu_from)
 
 
 def test_two_columns_of_one_name_are_refused(tmp_path: Path) -> None:
