@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import re
 from collections.abc import Iterator
+from contextlib import suppress
 from dataclasses import dataclass, replace
 from itertools import islice
 from pathlib import Path
@@ -97,6 +98,8 @@ class BagSource(ImageSource):
             asked = (left_topic, right_topic, imu_topic, truth_topic)
             self._topics = _choose_topics(reader, path, chain, asked, any_truth=truth_frame is not None)
             sizes, first = _first_images(reader, path, self._topics)
+            _, image = next(messages(reader, [self._topics.left], lambda _: None))
+            self._camera = frame_name(image.header.frame_id)
             is_placed = TF_STATIC in topics_of(reader, (TF_TYPE,))
             rig = read_stereo_yaml(chain, size=sizes[0]) if chain else _rig_from_bag(reader, path, self._topics, sizes)
             for size, lens, topic in zip(sizes, (rig.left, rig.right), (self._topics.left, self._topics.right)):
@@ -146,29 +149,23 @@ class BagSource(ImageSource):
 
     def _place(self, base: str) -> None:
         """Take ``base`` for the body."""
-        with open_bag(self.path) as reader:
-            camera = _camera_frame(reader, self._topics.left)
-            if base == camera:
-                told = f"'{printable(base)}' is the frame of the left images: its axes are the camera's, not a robot's"
-                raise SourceError(told, where=self.path, cure=f"name another frame, such as {_BASE}")
-            T_base_camera = _place_of(reader, base, camera, TF_TOPICS, self.path)
-        if T_base_camera is None:
-            told = f"no transform on {' or '.join(TF_TOPICS)} joins '{printable(base)}' to '{printable(camera)}'"
+        if base == self._camera:
+            told = f"'{printable(base)}' is the frame of the left images: its axes are the camera's, not a robot's"
+            raise SourceError(told, where=self.path, cure=f"name another frame, such as {_BASE}")
+        if (T_base_camera := self._place_on(base, TF_TOPICS)) is None:
+            told = f"no transform on {' or '.join(TF_TOPICS)} joins '{printable(base)}' to '{printable(self._camera)}'"
             cure = "name a frame that they join to it, or leave out --base-frame"
             raise SourceError(f"{told}, the frame of the left images", where=self.path, cure=cure)
         self.mounting = replace(self.mounting, T_body_cam=T_base_camera @ self.rectifier.T_left_cam, body=base)
 
     def _place_imu(self, imu: str) -> None:
-        """Take the place of the IMU from the bag's static transforms. One name for both frames, as some drivers have
-        it, says nothing."""
-        with open_bag(self.path) as reader:
-            camera = _camera_frame(reader, self._topics.left)
-            joined = f"{TF_STATIC} ('{printable(imu)}' to '{printable(camera)}')"
-            try:
-                T_imu_camera = None if imu == camera else _place_of(reader, imu, camera, (TF_STATIC,), self.path)
-            except SourceError:
-                self.remark(f"where the IMU sits on the camera is not taken from {joined}: it changes")
-                return
+        """Take the place of the IMU from the bag's static transforms."""
+        joined = f"{TF_STATIC} ('{printable(imu)}' to '{printable(self._camera)}')"
+        try:
+            T_imu_camera = self._place_on(imu, (TF_STATIC,))
+        except SourceError:
+            self.remark(f"where the IMU sits on the camera is not taken from {joined}: it changes")
+            return
         if T_imu_camera is not None:
             self.mounting = replace(self.mounting, T_imu_cam=T_imu_camera @ self.rectifier.T_left_cam)
             told = "a calibration with T_cam_imu would be used instead"
@@ -176,15 +173,29 @@ class BagSource(ImageSource):
 
     def _say_where_placed(self) -> None:
         """That the bag places its camera on a base_link, which is not used; what it says may as well be of no use."""
-        try:
-            with open_bag(self.path) as reader:
-                camera = _camera_frame(reader, self._topics.left)
-                if camera == _BASE or _place_of(reader, _BASE, camera, (TF_STATIC,), self.path) is None:
-                    return
-        except SourceError:
-            return
-        what = f"{TF_STATIC} says where the camera sits on '{_BASE}', which is not used"
-        self.remark(f"{what}: with --base-frame {_BASE} it is what 'gpvo publish' speaks of")
+        with suppress(SourceError):
+            if self._place_on(_BASE, (TF_STATIC,)) is not None:
+                what = f"{TF_STATIC} says where the camera sits on '{_BASE}', which is not used"
+                self.remark(f"{what}: with --base-frame {_BASE} it is what 'gpvo publish' speaks of")
+
+    def _place_on(self, base: str, topics: tuple[str, ...]) -> Array | None:
+        """T_base_camera (4, 4) by the transforms in the bag, None where they do not join the two; one name for both
+        frames, as some drivers have it, says nothing.
+
+        Raises SourceError where it changes: a mounting is rigid.
+        """
+        tree, place = FrameTree(), None
+        with open_bag(self.path) as reader:
+            known = [t for t in topics if t in topics_of(reader, (TF_TYPE,)) and base != self._camera]
+            for _, message in messages(reader, known, lambda _: None) if known else ():
+                tree.take(message)
+                now = tree.transform(base, self._camera)
+                if place is not None and now is not None and has_moved(place, now):
+                    told = f"the transform from '{printable(base)}' to '{printable(self._camera)}' changes"
+                    cure = "name a frame that is rigidly joined to the camera"
+                    raise SourceError(told, where=self.path, cure=cure)
+                place = now if place is None else place
+        return place
 
     def _read_truth(self, topic: str, frame: str | None) -> TruthLog:
         try:
@@ -202,28 +213,6 @@ class BagSource(ImageSource):
         truth = carry(Trajectory(t, T), place, MOTION_CAPTURE if _is_capture(topic) else UNKNOWN)
         check_overlap(truth, self.span_ns, self.path)
         return truth
-
-
-def _camera_frame(reader: Any, left_topic: str) -> str:
-    _, image = next(messages(reader, [left_topic], lambda _: None))
-    return frame_name(image.header.frame_id)
-
-
-def _place_of(reader: Any, base: str, camera: str, topics: tuple[str, ...], path: Path) -> Array | None:
-    """T_base_camera (4, 4) by the transforms in a bag, None where they do not join the two.
-
-    Raises SourceError where it changes: a mounting is rigid.
-    """
-    tree, place = FrameTree(), None
-    if known := [t for t in topics if t in topics_of(reader, (TF_TYPE,))]:
-        for _, message in messages(reader, known, lambda _: None):
-            tree.take(message)
-            now = tree.transform(base, camera)
-            if place is not None and now is not None and has_moved(place, now):
-                told = f"the transform from '{printable(base)}' to '{printable(camera)}' changes"
-                raise SourceError(told, where=path, cure="name a frame that is rigidly joined to the camera")
-            place = now if place is None else place
-    return place
 
 
 def _choose_topics(
