@@ -37,18 +37,22 @@ def is_plausible(size: Size | None) -> bool:
     return size is not None and max(size) <= MAX_SIDE_PX and size[0] * size[1] <= MAX_PIXELS
 
 
-def decoded(raw: NDArray[np.uint8], flags: int) -> NDArray[Any] | None:
-    """Encoded bytes as OpenCV decodes them with these ``flags``; None where they are no image, or claim to be larger
-    than any."""
+def decoded(raw: NDArray[np.uint8], *, grey: bool = False) -> NDArray[Any] | None:
+    """Encoded bytes as (H, W) or (H, W, channels), blue first, or ``grey`` in 8 bit; None where they are no image, or
+    claim to be larger than any.
+
+    As stored, not turned by an Exif orientation: that is what the calibration and the size in the header are of.
+    """
     if not (is_plausible(image_size(raw.data)) and is_whole(raw.data)):
         return None
     import cv2
 
+    kind = cv2.IMREAD_GRAYSCALE if grey else cv2.IMREAD_ANYDEPTH | cv2.IMREAD_ANYCOLOR
     # Whoever asked reports a damaged image; OpenCV need not warn as well.
     level = cv2.utils.logging.getLogLevel()
     cv2.utils.logging.setLogLevel(cv2.utils.logging.LOG_LEVEL_SILENT)
     try:
-        return cv2.imdecode(raw, flags)
+        return cv2.imdecode(raw, kind | cv2.IMREAD_IGNORE_ORIENTATION)
     except cv2.error:
         return None
     finally:
@@ -66,10 +70,6 @@ def is_whole(raw: bytes | memoryview) -> bool:
             return True
         at += 12 + length
     return False
-
-
-def _png(raw: bytes | memoryview) -> Size:
-    return struct.unpack(">II", raw[16:24])
 
 
 def _jpeg(raw: bytes | memoryview) -> Size | None:
@@ -130,7 +130,7 @@ def _webp(raw: bytes | memoryview) -> Size | None:
 
 
 _READERS: tuple[tuple[bytes, Callable[[bytes | memoryview], Size | None]], ...] = (
-    (rb"\x89PNG\r\n\x1a\n", _png),
+    (rb"\x89PNG\r\n\x1a\n", lambda raw: struct.unpack(">II", raw[16:24])),
     (rb"\xff\xd8\xff", _jpeg),
     (rb"BM", _bmp),
     (rb"II\*\x00|MM\x00\*", _tiff),

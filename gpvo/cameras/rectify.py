@@ -183,7 +183,7 @@ def read_mask(path: Path) -> NDArray[np.bool_]:
     if not path.is_file():
         raise CalibrationError("no such mask image", where=path)
     raw = np.fromfile(path, dtype=np.uint8)
-    image = decoded(raw, cv2.IMREAD_GRAYSCALE | cv2.IMREAD_IGNORE_ORIENTATION)
+    image = decoded(raw, grey=True)
     if image is None:
         raise CalibrationError("not readable as an image", where=path, cure="give the mask as PNG")
     white = image > 127

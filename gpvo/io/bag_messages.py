@@ -13,6 +13,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from gpvo.cameras.imagesize import decoded
 from gpvo.errors import SourceError, printable
 from gpvo.geometry import se3
 from gpvo.io.bag_reader import POSE_TYPES, messages, open_bag, stamp_ns, topics_of
@@ -49,14 +50,14 @@ def decode_message(message: Any, depth: Depth | None = None) -> NDArray[np.uint8
     """A sensor_msgs Image or CompressedImage as (H, W) uint8; None where it is damaged or of unknown encoding."""
     import cv2
 
-    from gpvo.io.images import decode_stored, to_grey8
+    from gpvo.io.images import to_grey8
 
     if hasattr(message, "encoding"):
         name, (pixels, bgr) = str(message.encoding).lower(), _raw_pixels(message)
     else:
         # Of image_transport, "bayer_rggb8; png compressed": it compresses the mosaic of a colour filter as it is.
         name, bgr = str(message.format).partition(";")[0].strip().lower(), True
-        pixels = decode_stored(np.asarray(message.data, dtype=np.uint8))
+        pixels = decoded(np.asarray(message.data, dtype=np.uint8))
     if pixels is None:
         return None
     pattern = _BAYER.get(name.rstrip("0123456789"))

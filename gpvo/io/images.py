@@ -24,7 +24,6 @@ from gpvo.parallel import prefetched
 from gpvo.types import ImuLog, Mounting, StereoCamera, StereoFrame, TruthLog
 
 IMAGE_SUFFIXES = (".png", ".jpg", ".jpeg", ".bmp", ".tif", ".tiff", ".pgm", ".ppm", ".webp")
-_AS_STORED = cv2.IMREAD_ANYDEPTH | cv2.IMREAD_ANYCOLOR | cv2.IMREAD_IGNORE_ORIENTATION
 _TO_GREY = {True: (cv2.COLOR_BGR2GRAY, cv2.COLOR_BGRA2GRAY), False: (cv2.COLOR_RGB2GRAY, cv2.COLOR_RGBA2GRAY)}
 _MAX_IMAGE_BYTES = 500_000_000
 _MAX_HEAD_BYTES = 1 << 20  # Thumbnails and colour profiles stand before the size.
@@ -74,17 +73,8 @@ def read_grey8(path: Path, depth: Depth | None = None) -> Image8 | None:
         raw = np.fromfile(path, dtype=np.uint8)
     except OSError:
         return None
-    image = decode_stored(raw)
+    image = decoded(raw)
     return None if image is None else to_grey8(image, depth=depth)
-
-
-def decode_stored(raw: NDArray[np.uint8]) -> NDArray[Any] | None:
-    """Encoded bytes as (H, W) or (H, W, channels), blue first; None where they are no image, or claim to be larger than
-    any.
-
-    As stored, not turned by an Exif orientation: that is what the calibration and the size in the header are of.
-    """
-    return decoded(raw, _AS_STORED)
 
 
 @dataclass(frozen=True)
