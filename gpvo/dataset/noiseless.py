@@ -36,12 +36,12 @@ def without_noise(log: VoLog, truth: TruthLog) -> tuple[TruthLog, TruthNoise]:
     return drawn_without_noise(log, truth, noise), noise
 
 
-def drawn_without_noise(log: VoLog, truth: TruthLog, noise: TruthNoise, seed: int = 0) -> TruthLog:
+def drawn_without_noise(log: VoLog, truth: TruthLog, noise: TruthNoise) -> TruthLog:
     """Poses at the frames with truth, drawn from what they may have been given that ``noise`` is in those told, and
     that errors of odometry's motions are white and a multivariate Student-t's, of the shape that geometry states, if it
     states any, and of a scale that is found with them.
 
-    The truth itself where there is no noise. ``seed``: of the draw.
+    The truth itself where there is no noise.
     """
     if not noise:
         return truth
@@ -55,7 +55,7 @@ def drawn_without_noise(log: VoLog, truth: TruthLog, noise: TruthNoise, seed: in
     T, known = interpolate_truth(truth, log.t_ns)
     errors, start, end = errors.rows(near), start[near], end[near]
     prior = noise.of_poses(rates_of(T, log.t_ns, known)) + np.diag(_least(errors.xi) ** 2)
-    off = _Chain(errors, start, end, prior, _shape(log, end)).draw(np.random.default_rng(seed))
+    off = _Chain(errors, start, end, prior, _shape(log, end)).draw(np.random.default_rng(0))
     return TruthLog(log.t_ns[known], (T @ se3.exp(-off))[known])
 
 

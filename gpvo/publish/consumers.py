@@ -135,16 +135,12 @@ def _check_robot_localization(pose: Array, twist: Array) -> list[Verdict]:
 
 def _check_px4(pose: Array, twist: Array) -> list[Verdict]:
     pose, twist = np.sqrt(pose), np.sqrt(twist)
-    out = []
-    for quantity, name, sigma, unit in (
-        ("velocity", "EKF2_EVV_NOISE", twist[:, :3], "m/s"),
-        ("position", "EKF2_EVP_NOISE", pose[:, :3], "m"),
-        ("yaw", "EKF2_EVA_NOISE", pose[:, 5], "rad"),
-    ):
-        value, minimum = PX4[name]
-        typical = 0.05 if quantity == "velocity" else 0.5
-        out.append(_verdict(quantity, name, value, sigma, unit, minimum=minimum, typical=typical))
-    return out
+    parts = (
+        ("velocity", "EKF2_EVV_NOISE", twist[:, :3], "m/s", 0.05),
+        ("position", "EKF2_EVP_NOISE", pose[:, :3], "m", 0.5),
+        ("yaw", "EKF2_EVA_NOISE", pose[:, 5], "rad", 0.5),
+    )
+    return [_verdict(q, n, PX4[n][0], sigma, unit, minimum=PX4[n][1], typical=t) for q, n, sigma, unit, t in parts]
 
 
 def _hidden(pose: Array, twist: Array) -> NDArray[np.bool_]:
