@@ -119,7 +119,7 @@ def on_smooth_path(twin: Flight, seed: Sequence[int]) -> Flight:
     run's IMU, with that one's rate, the noise that it states, and biases as large as filters expect."""
     # Only twins need the simulator.
     from gpvo.sim.imu import ImuModel, measured_imu
-    from gpvo.sim.recorded import smooth_path
+    from gpvo.sim.paths import smooth_path
 
     imu, t_ns = twin.imu, np.array([r.t_ns for r in twin.records], np.int64)
     assert twin.T_world_cam is not None

@@ -9,9 +9,9 @@ import numpy as np
 
 from gpvo.errors import GpvoError
 from gpvo.geometry import se3
-from gpvo.sim import paths, recorded
+from gpvo.sim import paths
 from gpvo.sim.events import CAMERA_HEIGHT_M
-from gpvo.sim.paths import Path3
+from gpvo.sim.paths import Path3, Recording
 from gpvo.sim.points_scenario import PointsScenario
 from gpvo.stats.series import interpolated
 from gpvo.types import Array
@@ -57,13 +57,13 @@ def make(chosen: PointsScenario, rng: np.random.Generator) -> tuple[Path3, Array
     return flown, cloud
 
 
-def _recording(path: str, duration_s: float, rest_s: float) -> recorded.Recording:
+def _recording(path: str, duration_s: float, rest_s: float) -> Recording:
     if not Path(path).exists():
         raise GpvoError(f"'{path}' is neither a kind of path nor a file", cure=f"{', '.join(PATHS)}, or a file")
-    return recorded.read_recording(Path(path), duration_s, rest_s)
+    return paths.read_recording(Path(path), duration_s, rest_s)
 
 
-def _street_along(recording: recorded.Recording, rng: np.random.Generator) -> tuple[Path3, Array]:
+def _street_along(recording: Recording, rng: np.random.Generator) -> tuple[Path3, Array]:
     """The recording as it is, and a street below it that goes on straight beyond both of its ends."""
     path = recording.placed(np.zeros(3), 0.0, 1.0, 0.0)
     at = path.position(np.arange(0.0, path.duration_s, 0.05)) - [0, 0, CAMERA_HEIGHT_M]

@@ -12,8 +12,7 @@ from numpy.typing import NDArray
 
 from gpvo.errors import SourceError
 from gpvo.io.run import read_run, read_tracks
-from gpvo.sim.paths import smooth_start
-from gpvo.sim.recorded import longest_flight_s
+from gpvo.sim.paths import longest_flight_s, smooth_start
 from gpvo.twin.replicate import estimate
 from gpvo.types import Array, StereoCamera, StereoTracks, VoLog
 from gpvo.vo.config import KNOWN_DEPTH_PX

@@ -13,8 +13,7 @@ from gpvo.geometry import se3
 from gpvo.sim import paths, vehicles
 from gpvo.sim.events import Episode, draw_episodes
 from gpvo.sim.imu import Motion
-from gpvo.sim.paths import Path3, place
-from gpvo.sim.recorded import Recording, read_recording
+from gpvo.sim.paths import Path3, Recording, place, read_recording
 from gpvo.sim.scenario import Scenario
 from gpvo.sim.worlds import World
 from gpvo.types import STANDARD_GRAVITY_MPS2, Array

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 from gpvo.errors import SourceError
-from gpvo.sim import paths, recorded
+from gpvo.sim import paths
 
 LOW, HIGH = np.array([-4.0, -4.0, 0.8]), np.array([4.0, 4.0, 3.2])
 
@@ -55,10 +55,10 @@ def test_flown_path_fits_and_keeps_its_turns(tmp_path):
     ]
     file = tmp_path / "flown.txt"
     file.write_text("\n".join(lines) + "\n")
-    path = recorded.read_recording(file, 15.0).fitted(LOW, HIGH, np.random.default_rng(0))
+    path = paths.read_recording(file, 15.0).fitted(LOW, HIGH, np.random.default_rng(0))
     motion = path.motion(100.0)
     assert (motion.position_m > LOW - 0.05).all()
     assert (motion.position_m < HIGH + 0.05).all()
     assert np.abs(motion.rate_radps[:, 2]).max() == pytest.approx(0.12, rel=0.1)
     with pytest.raises(SourceError, match="lasts"):
-        recorded.read_recording(file, 60.0)
+        paths.read_recording(file, 60.0)

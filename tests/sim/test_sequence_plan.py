@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from gpvo.errors import GpvoError
 from gpvo.geometry import se3
-from gpvo.sim import paths, recorded, sequence_plan
+from gpvo.sim import paths, sequence_plan
 from gpvo.sim.scenario import load_scenario
 
 RADIUS_M = 1.6
@@ -57,7 +57,7 @@ def test_recording_is_never_blown_up(tmp_path):
     scenario = load_scenario("tunnel", {"trajectory": str(recording(tmp_path)), "duration_s": 20.0})
     wide = pipe(400.0, 60.0)
     path = sequence_plan.plan_path(scenario, wide, np.random.default_rng(0))
-    read = recorded.read_recording(recording(tmp_path), 20.0)
+    read = paths.read_recording(recording(tmp_path), 20.0)
     extent = np.ptp(path.position(np.arange(3.0, 20.0, 0.02)), axis=0)
     assert extent[2] == pytest.approx(np.ptp(read.position_m[:, 2]), rel=0.05)
 

@@ -13,8 +13,8 @@ from gpvo.geometry import se3
 from gpvo.io import open_source
 from gpvo.io.run import read_run, write_run
 from gpvo.runner import run
+from gpvo.sim.paths import smooth_path
 from gpvo.sim.points import simulate_points
-from gpvo.sim.recorded import smooth_path
 from gpvo.twin.replicate import TwinSettings, make_twins
 from gpvo.types import TruthLog, VoLog
 from gpvo.vo.config import VoConfig
