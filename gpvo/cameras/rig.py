@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 from gpvo.cameras.imagesize import is_plausible
 from gpvo.cameras.models import CameraModel, PinholeRadtan
 from gpvo.errors import CalibrationError
+from gpvo.files import plain
 from gpvo.geometry import se3
 from gpvo.types import Array, StereoCamera
 from gpvo.types.sensors import MAX_BASELINE_M
@@ -80,15 +81,12 @@ class StereoRig:
     @property
     def is_rectified(self) -> bool:
         """Whether the images are already a rectified pair: no distortion, no rotation, equal intrinsics."""
-        a, b = self.left, self.right
-        return (
-            isinstance(a, PinholeRadtan)
-            and isinstance(b, PinholeRadtan)
-            and not any(a.distortion)
-            and not any(b.distortion)
-            and bool(np.allclose(a.intrinsics_px, b.intrinsics_px, atol=1e-6))
-            and bool(np.allclose(self.T_right_left[:3, :3], np.eye(3), atol=1e-9))
-            and bool(np.allclose(self.T_right_left[1:3, 3], 0.0, atol=1e-9))
+        if not all(isinstance(c, PinholeRadtan) and not any(c.distortion) for c in (self.left, self.right)):
+            return False
+        along_x = se3.from_rt(np.eye(3), self.T_right_left[:3, 3] * [1, 0, 0])
+        return bool(
+            np.allclose(self.left.intrinsics_px, self.right.intrinsics_px, atol=1e-6)
+            and np.allclose(self.T_right_left, along_x, atol=1e-9)
         )
 
     def with_masks(self, left: NDArray[np.bool_] | None, right: NDArray[np.bool_] | None) -> StereoRig:
@@ -106,14 +104,9 @@ class StereoRig:
                 "resolution_px": [model.width, model.height],
             }
 
-        return {
-            "left": lens(self.left),
-            "right": lens(self.right),
-            "T_right_left": self.T_right_left.tolist(),
-            "T_imu_left": None if self.T_imu_left is None else self.T_imu_left.tolist(),
-            "T_body_left": None if self.T_body_left is None else self.T_body_left.tolist(),
-            "timeshift_cam_imu_s": self.timeshift_cam_imu_s,
-        }
+        places = ("T_right_left", "T_imu_left", "T_body_left", "timeshift_cam_imu_s")
+        known: dict[str, object] = {name: plain(getattr(self, name)) for name in places}
+        return {"left": lens(self.left), "right": lens(self.right), **known}
 
 
 def check_pose(T: object, name: str, where: object = None) -> Array:
