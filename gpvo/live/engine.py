@@ -25,7 +25,8 @@ from gpvo.geometry.se3 import is_rigid, rotate_covariance
 from gpvo.io.trajectory import FARTHEST_M
 from gpvo.live.intake import Arrival
 from gpvo.live.late_truth import LateTruth
-from gpvo.live.stages import Stage, Taken, lost
+from gpvo.live.stages import Taken, lost
+from gpvo.live.stereo_stage import Stage
 from gpvo.online.guard import camera_problems
 from gpvo.online.predictor import Predictor
 from gpvo.publish.odometry import LEAST_VARIANCE, Odometry, OdometryBuilder, about_zero, lift

@@ -27,8 +27,8 @@ from gpvo.live.engine import Engine, Output
 from gpvo.live.intake import Arrival, Mailbox, arrivals, odometry_topic, replay
 from gpvo.live.late_truth import LateTruth
 from gpvo.live.outputs import FileOutput, MavlinkOutput, Px4Output, Wire, WireOutput, decode
-from gpvo.live.stages import BaseFrameStage, PoseStage, Stage
-from gpvo.live.stereo_stage import StereoSettings, StereoStage
+from gpvo.live.stages import BaseFrameStage, PoseStage
+from gpvo.live.stereo_stage import Stage, StereoSettings, StereoStage
 from gpvo.online.predictor import Predictor
 from gpvo.parallel import after_first, ending_signals
 from gpvo.publish.ros import check_topic
@@ -217,7 +217,6 @@ def topics_in(stage: Stage, settings: LiveSettings) -> dict[str, str]:
     truth = {settings.truth: POSE_TYPE_NAMES[settings.truth_type]} if settings.truth else {}
     if isinstance(stage, PoseStage):
         return {stage.topic: POSE_TYPE_NAMES[settings.odometry_type], **truth}
-    assert isinstance(stage, StereoStage)
     images = {t: IMAGE_TYPES[has_word("compressed", t)] for t in (stage.left, stage.right)}
     infos = {info_topic(t): INFO_TYPE for t in images} if stage.wants_info else {}
     placing = {TF_STATIC: TF_TYPE} if stage.wants_place else {}

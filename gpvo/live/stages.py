@@ -1,5 +1,8 @@
-"""From messages to VO records: what a stage is, the stage of another odometry's poses, and that of a robot's base frame
-by the transforms that ROS publishes on /tf and /tf_static.
+"""From messages to VO records: the stage of another odometry's poses, and that of a robot's base frame by the
+transforms that ROS publishes on /tf and /tf_static.
+
+A stage's ``method`` is the covariance that stands in for a prediction; on ``topic`` the source names its own frame, on
+which the camera sits at ``T_source_cam`` (4, 4), and at ``T_body_cam`` on the body whose odometry is published.
 """
 
 from __future__ import annotations
@@ -8,7 +11,7 @@ from collections import Counter, deque
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, replace
 from types import MappingProxyType
-from typing import Any, Protocol
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -32,6 +35,9 @@ from gpvo.stats.consistency import SEEN
 from gpvo.stats.series import Doubt
 from gpvo.types import IMPORTED, IMPORTED_POSE, Array, Status, StereoCamera, VoRecord
 
+if TYPE_CHECKING:
+    from gpvo.live.stereo_stage import StereoStage
+
 _MAX_M, _MAX_MPS, _MAX_RADPS = 1e7, 300.0, 50.0
 _ENOUGH, _GROWS = 20, 0.95
 _RECENT, _FEW = 50, 0.1  # messages that troubles are looked for in, and the share of them that is none
@@ -49,44 +55,6 @@ class Taken:
     T_parent_body: Array | None = None  # the source's own pose of the body, where it has one
     frame_id: str = "odom"
     child_frame_id: str = "base_link"
-
-
-class Stage(Protocol):
-    """``method``: the covariance that stands in for a prediction. ``topic``: where the source names its own frame, on
-    which the camera sits at ``T_source_cam`` (4, 4).
-    """
-
-    counts: Counter[str]
-    method: str
-    topic: str
-
-    @property
-    def camera(self) -> StereoCamera | None:
-        """Of the images; None for poses."""
-
-    @property
-    def odometry(self) -> Mapping[str, Any]:
-        """Settings of gpvo's own odometry; empty for poses."""
-
-    @property
-    def T_source_cam(self) -> Array:
-        """Camera to the frame that messages on ``topic`` name."""
-
-    @property
-    def T_body_cam(self) -> Array:
-        """Camera to the body whose odometry is published."""
-
-    def take(self, arrival: Arrival) -> Iterator[Taken]:
-        """What a message makes complete."""
-
-    def flush(self) -> Iterator[Taken]:
-        """What waited for a message that did not come."""
-
-    def reset(self) -> None:
-        """Begin anew with the next message."""
-
-    def problems(self) -> list[str]:
-        """What keeps it from working, in words."""
 
 
 class PoseStage:
@@ -250,7 +218,7 @@ class BaseFrameStage:
     the first place stays.
     """
 
-    def __init__(self, inner: Stage, base: str) -> None:
+    def __init__(self, inner: PoseStage | StereoStage, base: str) -> None:
         self.inner, self.base, self.topic = inner, frame_name(base), inner.topic
         self.counts: Counter[str] = inner.counts
         self.method = inner.method

@@ -29,7 +29,7 @@ from gpvo.io.images import SWAPPED, Image8, OrderCheck
 from gpvo.io.source import Depth, SourceReport
 from gpvo.io.stamps import PAIR_TOLERANCE_S, Stamps, no_pair, tolerance_ns
 from gpvo.live.intake import AHEAD_S, Arrival, Sequence, StampWatch
-from gpvo.live.stages import Taken
+from gpvo.live.stages import BaseFrameStage, PoseStage, Taken
 from gpvo.types import Array, ImuLog, StereoCamera, StereoFrame
 from gpvo.vo.config import VoConfig
 from gpvo.vo.odometry import StereoOdometry
@@ -314,6 +314,9 @@ class StereoStage:
             return None
         t, data = _columns(chosen)
         return ImuLog(t, data[:, :3], data[:, 3:])
+
+
+Stage = PoseStage | StereoStage | BaseFrameStage
 
 
 def _imu_row(message: Any) -> Array:
