@@ -27,26 +27,17 @@ from gpvo.files import digest_of_file, write_json, write_toml
 from gpvo.geometry.covariance import are_covariances, from_upper, upper
 from gpvo.io import run_folder, run_table
 from gpvo.io.parquet import RowGroup, join_tables, write_blocks, write_table
-from gpvo.io.run_folder import is_finished
-from gpvo.io.run_read import Run, read_predictions, read_run, read_tracks, table_of
+from gpvo.io.run_folder import is_finished as is_finished
+from gpvo.io.run_read import Run as Run
+from gpvo.io.run_read import read_predictions as read_predictions
+from gpvo.io.run_read import read_run as read_run
+from gpvo.io.run_read import read_tracks as read_tracks
+from gpvo.io.run_read import table_of
 from gpvo.io.run_table import SCHEMA
 from gpvo.io.snapshot import save_snapshot
 from gpvo.io.trajectory import tum_line
 from gpvo.types import Array, ImuLog, Mounting, Prediction, StereoCamera, StereoTracks, TruthLog, VoLog, VoRecord
 from gpvo.types.columns import batches
-
-__all__ = [
-    "Run",
-    "RunWriter",
-    "as_stored",
-    "copy_run",
-    "is_finished",
-    "read_predictions",
-    "read_run",
-    "read_tracks",
-    "write_predictions",
-    "write_run",
-]
 
 PREDICTIONS = (b"cov_total_00", "file of predictions")
 _POSES = 20_000  # that came or served last, as possible starts of later motions
