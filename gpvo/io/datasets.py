@@ -223,8 +223,7 @@ class KittiSource(FileSource):
         for folder in folders:
             files = (f for f in folder.iterdir() if f.suffix.lower() in IMAGE_SUFFIXES and f.stem.isdecimal())
             names.append({int(f.stem): f for f in files})
-        for folder, found in zip(folders, names):
-            if not found:
+            if not names[-1]:
                 raise SourceError("holds no images", where=folder, cure="expected names like 000000.png")
         surplus = {i for found in names for i in found if i >= len(stamps)}
         if surplus:

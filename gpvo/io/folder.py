@@ -14,7 +14,7 @@ from gpvo.cameras.readers import SIDES, find_calibration, read_stereo_yaml
 from gpvo.errors import CalibrationError, SourceError, counted
 from gpvo.io.images import IMAGE_SUFFIXES, FileSource, PairFiles, first_size
 from gpvo.io.source import SourceReport
-from gpvo.io.stamps import PAIR_TOLERANCE_S, check_padding, integer_ns, match_nearest, seconds_text_to_ns, tolerance_ns
+from gpvo.io.stamps import PAIR_TOLERANCE_S, check_padding, integer_ns, match_nearest, text_to_ns, tolerance_ns
 from gpvo.io.trajectory import UNKNOWN, carry, check_overlap, read_imu_csv, read_times, read_tum
 
 _PAIRS = (*SIDES, ("l", "r"))
@@ -107,10 +107,8 @@ def _named_pair(path: Path) -> tuple[Path, Path] | None:
 def _folder_pair(path: Path) -> tuple[Path, Path] | None:
     """The only two folders with images whose names have a side at one end and are else the same, such as stereo_left
     and stereo_right."""
-    folders, pairs = [f for f in sorted(path.iterdir()) if f.is_dir() and any(_images_in(f))], []
-    for pattern in _NAMES:
-        left, right = _pair_of(_by_side(folders, pattern)) or ({}, {})
-        pairs += [(left[stem], right[stem]) for stem in left.keys() & right.keys()]
+    folders = [f for f in sorted(path.iterdir()) if f.is_dir() and any(_images_in(f))]
+    pairs = [(left[k], right[k]) for left, right in _by_side(folders) for k in left.keys() & right.keys()]
     return pairs[0] if len(pairs) == 1 else None
 
 
@@ -120,32 +118,26 @@ def _images_in(folder: Path) -> Iterator[Path]:
     return (f for f in inside.iterdir() if _is_image(f))
 
 
-def _by_side(paths: list[Path], pattern: re.Pattern[str]) -> dict[str, dict[str, Path]]:
-    """Those with a side in their names: by side in small letters, then by what else the name holds."""
-    named: dict[str, dict[str, Path]] = {}
-    for path in paths:
-        if match := pattern.fullmatch(path.name if path.is_dir() else path.stem):
-            named.setdefault(match["side"].lower(), {})[match["stem"]] = path
-    return named
+def _by_side(paths: list[Path]) -> Iterator[tuple[dict[str, Path], dict[str, Path]]]:
+    """Those that are named by the left and by the right side, at either end of their names, by what else these hold."""
+    for pattern in _NAMES:
+        named: dict[str, dict[str, Path]] = {}
+        for path in paths:
+            if match := pattern.fullmatch(path.name if path.is_dir() else path.stem):
+                named.setdefault(match["side"].lower(), {})[match["stem"]] = path
+        if (pair := _pair_of(named)) is not None:
+            yield pair
 
 
 def _find_images(path: Path) -> tuple[dict[str, Path], dict[str, Path]]:
     """Images of both cameras, keyed by what their names have in common."""
     if (pair := _named_pair(path)) is None:
-        files = _side_files(path)
+        files = next(_by_side([f for f in sorted(path.iterdir()) if _is_image(f)]), ({}, {}))
         if all(files) or (pair := _folder_pair(path)) is None:
             return files
     # Without a side at their ends: 000012_left and 000012 alike.
     left, right = ({_END.sub("", f.stem): f for f in sorted(_images_in(side))} for side in pair)
     return left, right
-
-
-def _side_files(path: Path) -> tuple[dict[str, Path], dict[str, Path]]:
-    files = [f for f in sorted(path.iterdir()) if _is_image(f)]
-    for pattern in _NAMES:
-        if (pair := _pair_of(_by_side(files, pattern))) is not None:
-            return pair
-    return {}, {}
 
 
 def _stamps(
@@ -160,7 +152,7 @@ def _stamps(
     if is_stamp:
         check_padding(list(numbers.values()), path)
         try:
-            return {k: seconds_text_to_ns(n) if "." in n else integer_ns(n) for k, n in numbers.items()}
+            return {k: text_to_ns(n) if "." in n else integer_ns(n) for k, n in numbers.items()}
         except ValueError as error:
             raise SourceError(f"image names: {error}", where=path, cure="name them by nanoseconds") from None
     if times.is_file():

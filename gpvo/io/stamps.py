@@ -9,7 +9,7 @@ from datetime import datetime
 from decimal import Decimal, InvalidOperation
 from functools import partial
 from pathlib import Path
-from typing import Protocol, TypeVar
+from typing import TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 from gpvo.errors import SourceError
 from gpvo.files import at_once
 from gpvo.io.source import SourceReport
+from gpvo.types import StereoFrame, TrackFrame
 
 Stamps = NDArray[np.int64]
 """Nanoseconds (N,)."""
@@ -84,12 +85,7 @@ def _not_text(line: str, number: int, path: Path) -> SourceError:
     return SourceError(what, where=path, cure=f"keep the lines before it: head -n {number - 1} {path.name} > NEW")
 
 
-def seconds_text_to_ns(text: str) -> int:
-    """Decimal seconds as written, to whole nanoseconds: :func:`text_to_ns`."""
-    return text_to_ns(text, "s")
-
-
-def text_to_ns(text: str, unit: str) -> int:
+def text_to_ns(text: str, unit: str = "s") -> int:
     """A decimal number of ``unit`` (of :data:`UNITS_NS`) to whole nanoseconds without passing through a float.
 
     Raises ValueError where the text is no finite number, or more than 292 years from 1970.
@@ -111,7 +107,7 @@ def date_to_ns(text: str) -> int | None:
     """
     found = _DATE.fullmatch(text)
     whole = None if found is None else datetime.fromisoformat(f"{found[1]}T{found[2]}+00:00")
-    return None if found is None or whole is None else text_to_ns(f"{whole.timestamp():.0f}{found[3] or ''}", "s")
+    return None if found is None or whole is None else text_to_ns(f"{whole.timestamp():.0f}{found[3] or ''}")
 
 
 def likely_unit(text: str) -> str | None:
@@ -197,12 +193,7 @@ def check_padding(texts: Sequence[str], where: object) -> None:
         raise SourceError(what, where=where, cure=f"write seconds and nanoseconds as %d.%0{max(lengths)}d")
 
 
-class _Stamped(Protocol):
-    @property
-    def t_ns(self) -> int: ...
-
-
-F = TypeVar("F", bound=_Stamped)
+F = TypeVar("F", StereoFrame, TrackFrame)
 
 
 def in_order(frames: Iterable[F], report: SourceReport, usual_ns: float | None = None) -> Iterator[F]:
@@ -272,8 +263,8 @@ def astray(t_ns: Stamps) -> NDArray[np.bool_]:
 
 def usual_interval(t_ns: Iterable[int]) -> float | None:
     """Median interval of stamps [ns], whatever their order; None for fewer than three."""
-    stamps = np.unique(np.fromiter(t_ns, dtype=np.int64))
-    return float(np.median(np.diff(stamps))) if len(stamps) > 2 else None
+    steps = steps_ns(t_ns)
+    return float(np.median(steps)) if len(steps) > 1 else None
 
 
 def check_interval(
@@ -337,9 +328,9 @@ def reach_ns(tolerance_ns: int, left: Iterable[int], right: Iterable[int]) -> fl
     return min(tolerance_ns, 0.5 * float(np.median(steps))) if len(steps) > 2 else tolerance_ns
 
 
-def steps_ns(left: Iterable[int], right: Iterable[int]) -> Stamps:
-    """Intervals (N,) between the stamps of either camera, whatever their order."""
-    return np.concatenate([np.diff(np.unique(np.fromiter(side, dtype=np.int64))) for side in (left, right)])
+def steps_ns(*cameras: Iterable[int]) -> Stamps:
+    """Intervals (N,) between the stamps of each camera, whatever their order."""
+    return np.concatenate([np.diff(np.unique(np.fromiter(t_ns, dtype=np.int64))) for t_ns in cameras])
 
 
 def no_pair(tolerance_ns: int, nearest_ns: int, where: object) -> SourceError:

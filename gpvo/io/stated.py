@@ -29,7 +29,7 @@ from gpvo.geometry.covariance import (
     upper,
 )
 from gpvo.io.foreign import GROWING, NONE_STATED, ForeignLog, definite_in_plane, still_axes
-from gpvo.io.stamps import ns_to_seconds_text, seconds_text_to_ns, text_lines
+from gpvo.io.stamps import ns_to_seconds_text, text_lines, text_to_ns
 from gpvo.io.trajectory import Trajectory, read_tum_with, tum_line
 from gpvo.types import COUNT_FIELDS, IMPORTED, IMPORTED_POSE, Array, Status, StoredRecords, VoLog, VoRecord
 
@@ -79,7 +79,7 @@ def read_stated(path: Path) -> VoLog:
         yield VoRecord(int(t_ns[0]), int(t_ns[0]), Status.START, np.eye(4))
         for k in range(1, len(t_ns)):
             try:
-                start = k - 1 if behind == 21 else index.get(seconds_text_to_ns(rest[k][21]), k)
+                start = k - 1 if behind == 21 else index.get(text_to_ns(rest[k][21]), k)
             except ValueError as error:
                 raise SourceError(str(error), where=path) from None
             if start >= k:

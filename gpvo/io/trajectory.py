@@ -28,8 +28,8 @@ from gpvo.io.stamps import (
     integer_ns,
     is_number,
     ns_to_seconds_text,
-    seconds_text_to_ns,
     text_lines,
+    text_to_ns,
 )
 from gpvo.types import Array, ImuLog, ImuNoise, TruthLog
 
@@ -72,7 +72,7 @@ def read_tum_with(path: Path, more: int) -> tuple[Trajectory, list[list[str]]]:
     Raises SourceError as :func:`read_tum`.
     """
     what = f"{8 + more}: t tx ty tz qx qy qz qw" + (f" and {more} more" if more else "")
-    return _read_poses(path, None, range(8 + more, 9 + more), what, seconds_text_to_ns, (3, 4, 5, 6))
+    return _read_poses(path, None, range(8 + more, 9 + more), what, text_to_ns, (3, 4, 5, 6))
 
 
 def read_euroc_csv(path: str | Path) -> Trajectory:
@@ -119,7 +119,7 @@ def read_times(path: str | Path) -> Stamps:
         try:
             if (date_ns := date_to_ns(" ".join(fields))) is None and len(fields) != 1:
                 raise ValueError(f"{counted(len(fields), 'field')}, expected 1")
-            stamps.append(seconds_text_to_ns(fields[0]) if date_ns is None else date_ns)
+            stamps.append(text_to_ns(fields[0]) if date_ns is None else date_ns)
         except ValueError as error:
             raise SourceError(f"line {number}: {error}", where=p) from None
     return np.array(stamps, dtype=np.int64)
@@ -187,7 +187,7 @@ def _read_poses(
         try:
             stamps.append(stamp(fields[0]))
         except ValueError as error:
-            cure = cure_of_seconds(fields[0]) if stamp is seconds_text_to_ns else None
+            cure = cure_of_seconds(fields[0]) if stamp is text_to_ns else None
             cure = cure or cure_of_number(fields[0])
             raise SourceError(f"line {number}: {error}", where=path, cure=cure) from None
         texts.append(fields[0])
