@@ -34,7 +34,7 @@ class Wire(Protocol):
     """
 
     store: Any
-    ros1: bool
+    ros1: bool = False
 
     def subscribe(self, topic: str, msgtype: str, deliver: Callable[[str, bytes], None], *, kept: bool = False) -> None:
         """Deliver every message of a topic from now on."""

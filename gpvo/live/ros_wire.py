@@ -14,7 +14,7 @@ from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
 from gpvo.errors import GpvoError
 from gpvo.io.bag_reader import TF_TYPE
-from gpvo.live.outputs import Send
+from gpvo.live.outputs import Send, Wire
 
 _DEPTH, _KEPT = 10, 100
 
@@ -25,13 +25,11 @@ def message_class(msgtype: str) -> Any:
     return getattr(import_module(f"{package}.msg"), name)
 
 
-class Ros2Wire:
+class Ros2Wire(Wire):
     """A node of rclpy: ``node`` where one exists already, else one of its own, spun in a thread.
 
     Subscribes best effort, publishes reliably, keeps the last 10.
     """
-
-    ros1 = False
 
     def __init__(self, node: Any = None) -> None:
         _require("rclpy", "source ROS 2's setup file, or use --zenoh or --dds, which need no ROS")
@@ -81,7 +79,7 @@ class Ros2Wire:
             self._thread.join(1.0)
 
 
-class Ros1Wire:
+class Ros1Wire(Wire):
     """A node of rospy, at the master that ROS_MASTER_URI names. GpvoError where there is none."""
 
     ros1 = True

@@ -23,7 +23,7 @@ from rosbags.interfaces import Nodetype
 from rosbags.typesys import Stores, get_typestore
 
 from gpvo.errors import GpvoError, require
-from gpvo.live.outputs import Send
+from gpvo.live.outputs import Send, Wire
 from gpvo.publish import ros
 
 _QOS_PUBLISHER = "::,10:,:,:,,"  # reliable, volatile, keep last 10: what differs from the default is written
@@ -41,13 +41,11 @@ def _dds_name(msgtype: str) -> str:
     return f"{package}::msg::dds_::{name}_"
 
 
-class ZenohWire:
+class ZenohWire(Wire):
     """A session with the router or peer at ``address`` (``tcp/HOST:PORT``), by default the router on this machine.
 
     ``address`` beginning with ``listen:`` waits for others there instead.
     """
-
-    ros1 = False
 
     def __init__(self, address: str | None = None, domain: int = 0, node: str = "gpvo") -> None:
         require("zenoh")
@@ -124,10 +122,8 @@ class ZenohWire:
         return token
 
 
-class DdsWire:
+class DdsWire(Wire):
     """A participant of a ROS domain: subscribes best effort, publishes reliably, keeps the last 10."""
-
-    ros1 = False
 
     def __init__(self, domain: int = 0) -> None:
         require("cyclonedds")
