@@ -8,6 +8,7 @@ from gpvo.types.predictions import ByStamp as ByStamp
 from gpvo.types.predictions import MotionError as MotionError
 from gpvo.types.predictions import Prediction as Prediction
 from gpvo.types.predictions import StoredPredictions as StoredPredictions
+from gpvo.types.records import CALIBRATION as CALIBRATION
 from gpvo.types.records import COUNT_FIELDS as COUNT_FIELDS
 from gpvo.types.records import FLOAT_FIELDS as FLOAT_FIELDS
 from gpvo.types.records import IMPORTED as IMPORTED
