@@ -37,7 +37,7 @@ def write_report(
 def render(evaluations: Sequence[Evaluation], pictures: Sequence[MatchPicture] = (), model: str = "") -> str:
     """The page as text. Its table shows the numbers of ``gpvo evaluate --json``."""
     environment = templates("gpvo.evaluation")
-    environment.filters["number"] = _number
+    environment.filters["number"] = number
     environment.filters["tone"] = _tone
     runs = []
     for entry, evaluation in zip(document(evaluations)["runs"], evaluations, strict=True):
@@ -122,5 +122,6 @@ def _tone(nees: float | None) -> str:
     return "red" if nees > HONEST[1] else "amber" if nees < HONEST[0] else "green"
 
 
-def _number(value: float | None) -> str:
+def number(value: float | None) -> str:
+    """Three digits, as every table shows them; a dash for what could not be computed."""
     return "–" if value is None or not np.isfinite(value) else f"{value:.3g}"

@@ -39,27 +39,6 @@ ERRATA = (
 
 
 @dataclass(frozen=True)
-class Published:
-    """What the thesis prints [m]: 3-D RMSE, final error, predicted final error, and the GP's residual if any."""
-
-    rmse_m: float
-    final_m: float
-    predicted_m: float
-    residual_m: float | None = None
-
-    def document(self) -> dict[str, float | None]:
-        """The figures and their ratios, as scripts read them."""
-        return {
-            "rmse_m": self.rmse_m,
-            "final_error_m": self.final_m,
-            "predicted_final_error_m": self.predicted_m,
-            "ratio": self.predicted_m / self.final_m,
-            "residual_m": self.residual_m,
-            "residual_over_rmse": None if self.residual_m is None else self.residual_m / self.rmse_m,
-        }
-
-
-@dataclass(frozen=True)
 class FlightSet:
     """Flights of one kind.
 
@@ -86,7 +65,8 @@ class FlightSet:
 @dataclass(frozen=True)
 class Experiment:
     """One row of a table. ``method``: how the thesis stated the uncertainty there; ``sigma_px``: (pointing, matching)
-    of ``pointing_matching``. ``flights``, ``training``: names of flight sets. ``figure``: the thesis' number."""
+    of ``pointing_matching``. ``flights``, ``training``: names of flight sets. ``thesis``: what it prints, see
+    :func:`published`. ``figure``: its number there."""
 
     key: str
     table: str
@@ -94,7 +74,7 @@ class Experiment:
     flights: str
     training: str
     method: Literal["triangulation", "pointing_matching", "gp"]
-    published: Published | None
+    thesis: Mapping[str, float | None] | None
     figure: str = ""
     sigma_px: tuple[float, float] = (0.1, 0.5)
     stands_in: str = ""
@@ -111,7 +91,22 @@ def _values(table: Mapping[str, Any]) -> dict[str, Any]:
 def _experiment(table: Mapping[str, Any]) -> Experiment:
     values = _values(table)
     figures = values.pop("published", None)
-    return Experiment(**values, published=figures and Published(**figures))
+    return Experiment(**values, thesis=figures and published(**figures))
+
+
+def published(
+    rmse_m: float, final_m: float, predicted_m: float, residual_m: float | None = None
+) -> dict[str, float | None]:
+    """What the thesis prints [m], 3-D RMSE, final error, predicted final error, and the GP's residual if any, with the
+    ratios of these, as scripts read it."""
+    return {
+        "rmse_m": rmse_m,
+        "final_error_m": final_m,
+        "predicted_final_error_m": predicted_m,
+        "ratio": predicted_m / final_m,
+        "residual_m": residual_m,
+        "residual_over_rmse": None if residual_m is None else residual_m / rmse_m,
+    }
 
 
 FLIGHTS: dict[str, FlightSet] = {name: FlightSet(name, **_values(s)) for name, s in _DECLARED["flights"].items()}

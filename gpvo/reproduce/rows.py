@@ -8,7 +8,7 @@ are logs of another odometry. Each sequence is judged by models of the others. W
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import asdict, dataclass, replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, Literal
 
@@ -137,7 +137,7 @@ def real_cells(data: Path, frames: int | None, store: Store, workers: Workers) -
         return tuple(run.path(store) for run in good if run.preset == preset)
 
     gp = replace(
-        next(e for e in EXPERIMENTS if e.key == "4.3"), table="real", published=None, figure="", stands_in="real data"
+        next(e for e in EXPERIMENTS if e.key == "4.3"), table="real", thesis=None, figure="", stands_in="real data"
     )
     out: list[Cell] = []
     if len(runs_of("fast")) > 1:
@@ -160,35 +160,14 @@ def _each_by_the_others(e: Experiment, name: str, runs_of: Callable[[str], tuple
         yield Cell(e, way, "real", tuple(job for job in jobs if job is not None))
 
 
-@dataclass(frozen=True)
-class Scores:
-    """One way of one row [m]; the names are those of ``results.json``.
+def score(flights: Sequence[Bounds]) -> dict[str, Any]:
+    """One way of one row [m], as in ``results.json``; each flight counts alike.
 
     Roots of mean squares over the flights, ``*_interval``: 95 % of a bootstrap by flight, None with fewer than three.
     ``ratio``: predicted over actual final error. ``vector``: position error after the predicted mean is taken off;
     ``magnitude``: |error| minus its predicted expectation, the thesis' residual. ``coverage_3_sigma``: share of
     position errors inside, per axis.
     """
-
-    seeds: int
-    rmse_m: float
-    rmse_interval_m: Interval | None
-    final_error_m: float
-    final_error_interval_m: Interval | None
-    predicted_final_error_m: float
-    ratio: float
-    ratio_interval: Interval | None
-    vector_residual_m: float
-    vector_over_rmse: float
-    vector_over_rmse_interval: Interval | None
-    magnitude_residual_m: float
-    magnitude_over_rmse: float
-    magnitude_over_rmse_interval: Interval | None
-    coverage_3_sigma: float
-
-
-def score(flights: Sequence[Bounds]) -> Scores:
-    """Scores over flights; each flight counts alike."""
     squared_error = np.array([(b.error_m**2).sum(1).mean() for b in flights])
     final, predicted = squared_ends(flights)
     vector = np.array([((b.error_m - b.mean_m) ** 2).sum(1).mean() for b in flights])
@@ -196,18 +175,15 @@ def score(flights: Sequence[Bounds]) -> Scores:
     magnitude = np.array([((np.linalg.norm(b.error_m, axis=1) - m) ** 2).mean() for b, m in zip(flights, expected)])
     inside = [(np.abs(b.error_m - b.mean_m) <= 3 * b.sigma_m + 1e-9).mean() for b in flights]
     one = np.ones(len(flights))
-    return Scores(
-        len(flights),
-        *pooled(squared_error, one),
-        *pooled(final, one),
-        pooled(predicted, one)[0],
-        *pooled(predicted, final),
-        pooled(vector, one)[0],
-        *pooled(vector, squared_error),
-        pooled(magnitude, one)[0],
-        *pooled(magnitude, squared_error),
-        float(np.mean(inside)),
-    )
+    out: dict[str, Any] = {"seeds": len(flights)}
+    out["rmse_m"], out["rmse_interval_m"] = pooled(squared_error, one)
+    out["final_error_m"], out["final_error_interval_m"] = pooled(final, one)
+    out["predicted_final_error_m"] = pooled(predicted, one)[0]
+    out["ratio"], out["ratio_interval"] = pooled(predicted, final)
+    for name, residual in (("vector", vector), ("magnitude", magnitude)):
+        out[f"{name}_residual_m"] = pooled(residual, one)[0]
+        out[f"{name}_over_rmse"], out[f"{name}_over_rmse_interval"] = pooled(residual, squared_error)
+    return out | {"coverage_3_sigma": float(np.mean(inside))}
 
 
 def squared_ends(flights: Sequence[Bounds]) -> tuple[Array, Array]:
@@ -253,25 +229,24 @@ def over_seeds(seeds: int, statistic: Callable[[NDArray[np.int64]], Array]) -> I
 
 def scored(cells: Sequence[Cell], store: Store) -> list[dict[str, Any]]:
     """One entry per experiment and mode, in the order of the cells, as scripts read it."""
-    made: dict[tuple[BoundsJob, ...], Scores] = {}
+    made: dict[tuple[BoundsJob, ...], dict[str, Any]] = {}
     out: dict[tuple[str, str], dict[str, Any]] = {}
     for cell in cells:
         # Cells of several tables share their bounds, and the work.
         found = made.get(cell.jobs) or made.setdefault(cell.jobs, score(cell.load(store)))
-        key = (cell.experiment.key, cell.mode)
-        row = out.setdefault(key, {**_head(cell.experiment), "mode": cell.mode, "seeds": found.seeds, "ways": {}})
-        row["ways"][cell.way] = asdict(found)
+        e = cell.experiment
+        row = out.setdefault((e.key, cell.mode), {
+            **{name: getattr(e, name) for name in ("key", "table", "title", "method")},
+            "sigma_px": list(e.sigma_px) if e.method == "pointing_matching" else None,
+            "warning": e.warning,
+            "stands_in": e.stands_in,
+            "thesis": e.thesis,
+            "mode": cell.mode,
+            "seeds": found["seeds"],
+            "ways": {},
+        })  # fmt: skip
+        row["ways"][cell.way] = found
     return list(out.values())
-
-
-def _head(e: Experiment) -> dict[str, Any]:
-    return {
-        **{name: getattr(e, name) for name in ("key", "table", "title", "method")},
-        "sigma_px": list(e.sigma_px) if e.method == "pointing_matching" else None,
-        "warning": e.warning,
-        "stands_in": e.stands_in,
-        "thesis": None if e.published is None else e.published.document(),
-    }
 
 
 def targets(rows: Sequence[Mapping[str, Any]]) -> list[dict[str, Any]]:

@@ -12,6 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from gpvo import __version__
+from gpvo.evaluation.report import number
 from gpvo.files import plain, refuse_foreign, write_csv, write_json, write_text
 from gpvo.reproduce import models, rows, tables
 from gpvo.reproduce.bounds import BoundMethod, Bounds, BoundsJob, load_bounds
@@ -20,7 +21,7 @@ from gpvo.reproduce.flights import Flights, fly_all
 from gpvo.reproduce.models import OTHER, SAME, Studies
 from gpvo.reproduce.rows import Cell, Interval, over_seeds, pooled, squared_ends
 from gpvo.reproduce.stages import Store, Workers, only_user
-from gpvo.reproduce.tables import MODES, number, with_interval
+from gpvo.reproduce.tables import MODES, with_interval
 from gpvo.stats.series import sequence_bootstrap
 from gpvo.types import Array
 

@@ -13,6 +13,7 @@ from matplotlib.figure import Figure
 
 from gpvo.evaluation.panels import line, panel
 from gpvo.evaluation.plots import figure_of, save
+from gpvo.evaluation.report import number
 from gpvo.files import columns_of, markdown_table, templates
 from gpvo.reproduce.bounds import Bounds
 from gpvo.reproduce.models import Studies
@@ -29,11 +30,6 @@ _COLUMNS = (
     "ratio_interval_low", "ratio_interval_high", "vector_residual_m", "vector_over_rmse", "magnitude_residual_m",
     "magnitude_over_rmse", "coverage_3_sigma",
 )  # fmt: skip
-
-
-def number(value: float | None) -> str:
-    """Three digits, as every table shows them; a dash for what could not be computed."""
-    return "–" if value is None else f"{value:.3g}"
 
 
 def with_interval(value: float | None, interval: Sequence[float] | None) -> str:

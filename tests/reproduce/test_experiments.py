@@ -27,19 +27,19 @@ PRINTED = [
 
 def test_every_row_of_the_thesis_is_there():
     found = [
-        (e.table, p.rmse_m, p.final_m, p.predicted_m, p.residual_m)
+        (e.table, p["rmse_m"], p["final_error_m"], p["predicted_final_error_m"], p["residual_m"])
         for e in EXPERIMENTS
-        if (p := e.published) is not None
+        if (p := e.thesis) is not None
     ]
     assert found == PRINTED
     assert len({e.key for e in (*EXPERIMENTS, *SENSITIVITY)}) == len(EXPERIMENTS) + len(SENSITIVITY)
 
 
 def test_the_ratios_of_the_thesis_are_as_the_thesis_has_them():
-    ratios = [e.published.document()["ratio"] for e in EXPERIMENTS if e.published]
+    ratios = [e.thesis["ratio"] for e in EXPERIMENTS if e.thesis]
     assert min(ratios) == pytest.approx(1.3, abs=0.06)
     assert max(ratios) == pytest.approx(2.4, abs=0.05)
-    gp = [e.published.document()["residual_over_rmse"] for e in EXPERIMENTS if e.published]
+    gp = [e.thesis["residual_over_rmse"] for e in EXPERIMENTS if e.thesis]
     assert all(r > 1.0 for r in gp if r is not None)
 
 
