@@ -34,6 +34,7 @@ from gpvo.vo.rig_findings import STATE_FILE, read_start, read_state
 
 MIN_POINTS = 12
 """A run whose median motion has fewer inliers is refused: path, landmarks and noise cannot be told apart."""
+_SHOWN_BY_IMAGES = ("n_detected", "n_stereo", "brightness", "contrast", "sharpness", "noise_level")
 
 
 @dataclass(frozen=True)
@@ -148,7 +149,9 @@ def twin_source(original: Original, settings: TwinSettings, replicate: int) -> T
     run, seen = original.run, original.seen
     rng = np.random.default_rng([settings.seed, replicate, 29])
     pixels = _projected(original, settings, replicate)
-    noise = _drawn_noise(original, rng)
+    # The residuals of each track, as a whole, with its sign; but an outlier is an event, and happens again as it was.
+    signs = draw_signs(len(original.structure.points_world), original.neighbours, rng)[seen.track]
+    noise = original.noise_px * np.where(original.structure.weight > 0, signs, 1.0)[:, None]
     if original.common:
         drawn = original.common.draw(seen, np.random.default_rng([settings.seed, replicate, 37]))
         noise += np.where(original.structure.weight[:, None] > 0, drawn, 0.0)
@@ -214,13 +217,6 @@ def _projected(original: Original, settings: TwinSettings, replicate: int) -> tu
     return left, right + np.stack([-displaced_d, displaced_row], axis=1)
 
 
-def _drawn_noise(original: Original, rng: np.random.Generator) -> Array:
-    """(M, 3) noise [px]: the residuals of each track, as a whole, with its sign. An outlier is an event, not noise: it
-    happens again as it was."""
-    signs = draw_signs(len(original.structure.points_world), original.neighbours, rng)[original.seen.track]
-    return original.noise_px * np.where(original.structure.weight > 0, signs, 1.0)[:, None]
-
-
 def make_twins(
     path: Path, out: Path, settings: TwinSettings, *, jobs: int = 1, on_twin: Callable[[], None] = lambda: None
 ) -> list[Path]:
@@ -235,7 +231,9 @@ def make_twins(
     if (other := next(others, None)) is not None:
         cure = "remove it, make as many as before, or give another folder"
         raise SourceError(f"is a twin that {settings.replicates} replicates would not replace", where=other, cure=cure)
-    name, of = read_run(path).name, _digest(path, settings)
+    # What decides the twins of a run.
+    of = digest_of({p.name: digest_of_file(p) for name in OWN if (p := path / name).is_file()}, asdict(settings))
+    name = read_run(path).name
     folders = [out / f"{name}-twin{k}" for k in made]
     left = [k for k in made if not _is_made(folders[k], of, k)]
     for _ in range(len(made) - len(left)):
@@ -244,11 +242,6 @@ def make_twins(
         original = estimate(path)
         map_jobs(_make_twin, [(original, settings, k, out, of) for k in left], jobs=jobs, on_done=on_twin)
     return folders
-
-
-def _digest(path: Path, settings: TwinSettings) -> str:
-    """Of what decides the twins of a run."""
-    return digest_of({p.name: digest_of_file(p) for name in OWN if (p := path / name).is_file()}, asdict(settings))
 
 
 def _is_made(folder: Path, of: str, replicate: int) -> bool:
@@ -263,12 +256,19 @@ def _make_twin(original: Original, settings: TwinSettings, replicate: int, out: 
     source = twin_source(original, settings, replicate)
     about = {**asdict(settings), "of": original.run.name, "replicate": replicate, "digest": of}
     about["common_variance_px2"] = original.common.about()
-    conditions, truth = _Conditions(original), source.truth
+    truth, log = source.truth, original.run.log
     factor = np.ones(6) if settings.gap is None else settings.gap.factors(settings.replicates)[replicate]
+    matched = np.bincount(original.seen.frame[~original.first], minlength=len(log))
+    as_seen = {r.t_ns: (r, max(r.n_tracked - int(n), 0)) for r, n in zip(log, matched)}
 
     def amend(record: VoRecord) -> VoRecord:
+        """With what points alone cannot show, as the run saw it: its images, and points without a match."""
         assert truth is not None
-        return restated(conditions.amend(record), truth, factor)
+        own, unmatched = as_seen[record.t_ns]
+        shown: dict[str, Any] = {name: getattr(own, name) for name in _SHOWN_BY_IMAGES}
+        if record.n_tracked >= 0:
+            shown["n_tracked"] = record.n_tracked + unmatched
+        return restated(replace(record, **shown), truth, factor)
 
     run_odometry(
         source, out / source.name, original.config, calibration_state=original.start, amend=amend, meta={"twin": about}
@@ -290,19 +290,3 @@ def read_tolerance(text: str) -> tuple[str, Tolerance]:
     if not values or set(values) - known or not small:
         raise GpvoError("does not describe a tolerance: numbers from 0 to 0.2", where=path, cure=cure)
     return path.stem, Tolerance(**{k: float(v) for k, v in values.items()})
-
-
-class _Conditions:
-    """What points alone cannot show, as the run saw it: statistics of its images, and points without a match."""
-
-    _PICTURE = ("n_detected", "n_stereo", "brightness", "contrast", "sharpness", "noise_level")
-
-    def __init__(self, original: Original) -> None:
-        matched = np.bincount(original.seen.frame[~original.first], minlength=len(original.run.log))
-        self._by_stamp = {r.t_ns: (r, max(r.n_tracked - int(n), 0)) for r, n in zip(original.run.log, matched)}
-
-    def amend(self, record: VoRecord) -> VoRecord:
-        """The record of the twin, completed."""
-        own, unmatched = self._by_stamp[record.t_ns]
-        n_tracked = record.n_tracked + unmatched if record.n_tracked >= 0 else record.n_tracked
-        return replace(record, n_tracked=n_tracked, **{name: getattr(own, name) for name in self._PICTURE})
