@@ -103,7 +103,7 @@ def _write_files(e: Evaluation, name: str, *, stated: Path | None, tables: Path 
     if stated is not None:
         from gpvo.evaluation.score import write_statements
 
-        if len(write_statements(e, stated, name)) == 1:  # the truth
+        if not write_statements(e, stated, name):
             text = f"{name} states no covariance of single motions: {stated} holds its truth alone, nothing to score"
             warnings.warn(text, stacklevel=2)
     if tables is not None:

@@ -152,26 +152,22 @@ def _method_document(c: Consistency) -> dict[str, Any]:
     }
 
 
-def write_tables(e: Evaluation, folder: Path, name: str) -> list[Path]:
+def write_tables(e: Evaluation, folder: Path, name: str) -> None:
     """``NAME_est.tum`` and ``NAME_truth.tum`` (evo: ``evo_ape tum NAME_truth.tum NAME_est.tum``), ``NAME_motions.csv``
     (each motion's error and every method's sigma), and ``NAME_methods.csv`` and ``.tex`` (scores)."""
     log, known = e.run.log, e.covered
-    paths = [
-        folder / f"{name}_{kind}" for kind in ("est.tum", "truth.tum", "motions.csv", "methods.csv", "methods.tex")
-    ]
-    write_tum(paths[0], log.t_ns[known], e.T_est[known])
-    write_tum(paths[1], log.t_ns[known], e.T_true[known])
+    write_tum(folder / f"{name}_est.tum", log.t_ns[known], e.T_est[known])
+    write_tum(folder / f"{name}_truth.tum", log.t_ns[known], e.T_true[known])
     rows = e.errors.index
     columns: dict[str, Any] = {"t_s": log.t_ns[rows] * 1e-9, "dt_s": e.errors.dt_s}
     columns |= {f"error_{a}": e.errors.xi[:, i] for i, a in enumerate(AXES)}
     for s in e.statements:
         sigma = np.sqrt(variances(s.covariance[rows]))
         columns |= {f"{s.method}_sigma_{a}": sigma[:, i] for i, a in enumerate(AXES[: s.dof])}
-    write_csv(paths[2], columns)
+    write_csv(folder / f"{name}_motions.csv", columns)
     scores = _scores(run_document(e)["methods"])
-    write_csv(paths[3], scores)
-    write_text(paths[4], latex(scores), own=(rb"\A\\begin\{tabular\}", "table"))
-    return paths
+    write_csv(folder / f"{name}_methods.csv", scores)
+    write_text(folder / f"{name}_methods.tex", latex(scores), own=(rb"\A\\begin\{tabular\}", "table"))
 
 
 def _scores(methods: Mapping[str, Any]) -> dict[str, list[Any]]:

@@ -7,7 +7,7 @@ intervals; the truth's noise is declared and counted in; a lost motion is charge
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import asdict, dataclass, replace
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -39,44 +39,26 @@ POOLED = ("energy_translation_m", "energy_rotation_rad", "nll_per_dim", "nees_do
 _WHOLE = 0.95
 
 
-@dataclass(frozen=True)
-class SequenceScore:
-    """Of one sequence. Means over its motions; ``nees_dof_over`` {"1s", "1m", "10m", "100m"} None where none fits.
-
-    ``axes``: names of those that NLL and NEES are of, see :func:`gpvo.stats.consistency.seen_axes`.
-    """
-
-    sequence: str
-    motions: int
-    lost: int
-    axes: tuple[str, ...]
-    energy_translation_m: float
-    energy_rotation_rad: float
-    nll_per_dim: float
-    nees_dof: float
-    nees_dof_over: dict[str, float | None]
-    nees_dof_by_difficulty: tuple[float, ...]
-    coverage_by_difficulty: tuple[float, ...]
-    correlation_gain_nats: float
-    ate_rmse_m: float
-
-
 def score(files: Sequence[tuple[Path, Path]], options: EvaluateOptions | None = None) -> dict[str, Any]:
     """Scores of pairs (stated, truth), per ``sequences`` and ``pooled`` with 95 % intervals over the sequences.
 
     Raises SourceError where a file is malformed, or states nothing while its truth lasts.
     """
     scores = [score_sequence(stated, truth, options) for stated, truth in files]
-    pooled = {name: sequence_bootstrap(np.array([getattr(s, name) for s in scores])).document() for name in POOLED}
+    pooled = {name: sequence_bootstrap(np.array([s[name] for s in scores])).document() for name in POOLED}
     return {
         "schema": 1,
-        "sequences": [asdict(s) for s in scores],
-        "pooled": {**pooled, "motions": sum(s.motions for s in scores), "lost": sum(s.lost for s in scores)},
+        "sequences": scores,
+        "pooled": {**pooled, **{name: sum(s[name] for s in scores) for name in ("motions", "lost")}},
     }
 
 
-def score_sequence(stated: Path, truth: Path, options: EvaluateOptions | None = None) -> SequenceScore:
-    """Scores of one file of stated motions against TUM poses of the same camera."""
+def score_sequence(stated: Path, truth: Path, options: EvaluateOptions | None = None) -> dict[str, Any]:
+    """Scores of one file of stated motions against TUM poses of the same camera: means over the motions.
+
+    ``nees_dof_over`` {"1s", "1m", "10m", "100m"}: None where none fits. ``axes``: names of those that NLL and NEES are
+    of, see :func:`gpvo.stats.consistency.seen_axes`.
+    """
     log, poses = _read(stated), read_tum(truth)
     of_poses = TruthLog(poses.t_ns, poses.T_world_body)
     check_overlap(of_poses, log.t_ns, truth)
@@ -92,21 +74,21 @@ def score_sequence(stated: Path, truth: Path, options: EvaluateOptions | None = 
     charged_m, charged_rad = _charged(log, evaluation)
     joint = c.nees_dof["joint"]
     over = {"1s": c.one_second, **{f"{h.span:g}m": h for h in c.horizons}}
-    return SequenceScore(
-        sequence=stated.stem,
-        motions=usable,
-        lost=int(log.lost.sum()),
-        axes=tuple(AXES[k] for k in c.axes),
-        energy_translation_m=_mean_with(c.energy["translation_m"] or 0.0, c.count, charged_m),
-        energy_rotation_rad=_mean_with(c.energy["rotation_rad"] or 0.0, c.count, charged_rad),
-        nll_per_dim=c.nll_per_dim,
-        nees_dof=np.nan if joint is None else joint.mean,
-        nees_dof_over={n: h.nees_dof_truth_noise if h.count else None for n, h in over.items()},
-        nees_dof_by_difficulty=tuple(c.by_difficulty["nees_dof"] or ()),
-        coverage_by_difficulty=tuple(c.by_difficulty["coverage"] or ()),
-        correlation_gain_nats=c.correlation_gain_nats or 0.0,
-        ate_rmse_m=evaluation.trajectory.ate_rmse_m,
-    )
+    return {
+        "sequence": stated.stem,
+        "motions": usable,
+        "lost": int(log.lost.sum()),
+        "axes": tuple(AXES[k] for k in c.axes),
+        "energy_translation_m": _mean_with(c.energy["translation_m"] or 0.0, c.count, charged_m),
+        "energy_rotation_rad": _mean_with(c.energy["rotation_rad"] or 0.0, c.count, charged_rad),
+        "nll_per_dim": c.nll_per_dim,
+        "nees_dof": np.nan if joint is None else joint.mean,
+        "nees_dof_over": {n: h.nees_dof_truth_noise if h.count else None for n, h in over.items()},
+        "nees_dof_by_difficulty": tuple(c.by_difficulty["nees_dof"] or ()),
+        "coverage_by_difficulty": tuple(c.by_difficulty["coverage"] or ()),
+        "correlation_gain_nats": c.correlation_gain_nats or 0.0,
+        "ate_rmse_m": evaluation.trajectory.ate_rmse_m,
+    }
 
 
 def _read(stated: Path) -> VoLog:
@@ -249,26 +231,23 @@ def write_left_out(trained: TrainedModel, runs: Sequence[Run], config: TrainConf
             write_statements(evaluate_run(run, predictor, options), folder, name, waits=config.waits)
 
 
-def write_statements(evaluation: Evaluation, folder: Path, name: str, waits: str = "drop") -> list[Path]:
-    """What each method states of a run's motions, a file per method ``METHOD/RUN.txt``, and the ``truth/RUN.txt``.
+def write_statements(evaluation: Evaluation, folder: Path, name: str, waits: str = "drop") -> int:
+    """What each method states of a run's motions, a file per method ``METHOD/RUN.txt``, and the ``truth/RUN.txt``; how
+    many methods there are.
 
     Truth that wanders while the vehicle stands, or jumps, is left out of its file, except with ``waits`` "keep".
     """
-    log, name = evaluation.run.log, f"{name}.txt"
-    truth, known = folder / "truth" / name, evaluation.covered
+    log, name, known = evaluation.run.log, f"{name}.txt", evaluation.covered
     if waits == "drop" and evaluation.unscored and evaluation.run.truth is not None:
         waiting = false_motions(log, evaluation.run.truth)
         for first, last in waiting:
             known = known & ~((log.t_ns > first) & (log.t_ns < last))
         # A motion over the whole wait still has truth at both ends.
         known = known & ~(in_waits(log, waiting) & known[log.parent])
-    write_tum(truth, log.t_ns[known], evaluation.T_true[known])
-    written = [truth]
-    for statement in evaluation.statements:
-        if statement.dof != 6:
-            continue
+    write_tum(folder / "truth" / name, log.t_ns[known], evaluation.T_true[known])
+    count = 0
+    for statement in (s for s in evaluation.statements if s.dof == 6):
         T, C = corrected(log, statement.mean), np.where(log.usable[:, None, None], statement.covariance, np.nan)
-        path = folder / statement.method / name
-        write_stated(path, log, T, C)
-        written.append(path)
-    return written
+        write_stated(folder / statement.method / name, log, T, C)
+        count += 1
+    return count

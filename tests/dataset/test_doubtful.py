@@ -184,7 +184,7 @@ def test_consistency_is_not_judged_by_such_a_truth_but_the_path_is(tmp_path):
     # Nor by its file: gpvo score, which knows of no IMU, gives the same.
     write_statements(evaluations[1], tmp_path / "stated", "flight")
     of_files = score_sequence(*(tmp_path / "stated" / of / "flight.txt" for of in ("triangulation", "truth")))
-    assert of_files.nees_dof == pytest.approx(nees[1], rel=1e-3)
+    assert of_files["nees_dof"] == pytest.approx(nees[1], rel=1e-3)
 
 
 def test_a_motion_over_the_whole_wait_is_not_scored_by_its_file_either(tmp_path):

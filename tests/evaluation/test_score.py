@@ -43,16 +43,16 @@ def test_files_alone_give_the_scores_of_evaluate(written) -> None:
     folder, evaluation = written
     found = score_sequence(folder / "triangulation" / "hall.txt", folder / "truth" / "hall.txt")
     of_run = evaluation.consistency["triangulation"]
-    assert (found.motions, found.lost) == (N - 2, 2)
+    assert (found["motions"], found["lost"]) == (N - 2, 2)
     assert isinstance(read_stated(folder / "triangulation" / "hall.txt").records, StoredRecords)
     # Nine decimals of a file stand for motions of sigma 0.2 to 2e-3.
-    assert found.nees_dof == pytest.approx(of_run.nees_dof["joint"].mean, rel=1e-4)
-    assert found.nll_per_dim == pytest.approx(of_run.nll_per_dim, abs=1e-4)
-    assert found.correlation_gain_nats == pytest.approx(of_run.correlation_gain_nats, abs=1e-4)
-    assert found.nees_dof_by_difficulty == pytest.approx(of_run.by_difficulty["nees_dof"], rel=1e-3)
-    assert found.coverage_by_difficulty == pytest.approx(of_run.by_difficulty["coverage"], abs=0.02)
-    assert found.nees_dof_over["1m"] == pytest.approx(of_run.horizons[0].nees_dof, rel=1e-4)
-    assert found.ate_rmse_m == pytest.approx(evaluation.trajectory.ate_rmse_m, rel=1e-4)
+    assert found["nees_dof"] == pytest.approx(of_run.nees_dof["joint"].mean, rel=1e-4)
+    assert found["nll_per_dim"] == pytest.approx(of_run.nll_per_dim, abs=1e-4)
+    assert found["correlation_gain_nats"] == pytest.approx(of_run.correlation_gain_nats, abs=1e-4)
+    assert found["nees_dof_by_difficulty"] == pytest.approx(of_run.by_difficulty["nees_dof"], rel=1e-3)
+    assert found["coverage_by_difficulty"] == pytest.approx(of_run.by_difficulty["coverage"], abs=0.02)
+    assert found["nees_dof_over"]["1m"] == pytest.approx(of_run.horizons[0].nees_dof, rel=1e-4)
+    assert found["ate_rmse_m"] == pytest.approx(evaluation.trajectory.ate_rmse_m, rel=1e-4)
 
 
 def test_a_lost_motion_is_charged_with_its_length(written) -> None:
@@ -62,7 +62,7 @@ def test_a_lost_motion_is_charged_with_its_length(written) -> None:
     lost = [se3.log(se3.inverse(T[39]) @ T[k]) for k in (40, 41)]
     of_run = evaluation.consistency["triangulation"].energy["translation_m"]
     expected = (of_run * (N - 2) + sum(float(np.linalg.norm(xi[:3])) for xi in lost)) / N
-    assert found.energy_translation_m == pytest.approx(expected, rel=1e-4)
+    assert found["energy_translation_m"] == pytest.approx(expected, rel=1e-4)
 
 
 def test_honest_beats_timid_and_bold(tmp_path: Path) -> None:
@@ -74,7 +74,7 @@ def test_honest_beats_timid_and_bold(tmp_path: Path) -> None:
         C[1:] = factor * stated_covariance()
         write_stated(tmp_path / "stated.txt", log, log.trajectory(), C)
         s = score_sequence(tmp_path / "stated.txt", tmp_path / "truth.txt")
-        energy[factor], nll[factor] = s.energy_translation_m, s.nll_per_dim
+        energy[factor], nll[factor] = s["energy_translation_m"], s["nll_per_dim"]
     assert min(energy, key=energy.__getitem__) == min(nll, key=nll.__getitem__) == 1.0
 
 
@@ -256,9 +256,9 @@ def test_the_table_of_a_training_is_scored_again_from_files_alone(
         for fold in folds:
             sequence, of_table = f"{fold['held_out']}.txt", fold["methods"][method]
             found = score_sequence(stated / method / sequence, stated / "truth" / sequence)
-            assert found.motions == fold["rows"], method
-            assert found.nees_dof == pytest.approx(of_table["nees_dof"]["joint"], rel=1e-3), method
-            assert found.nll_per_dim == pytest.approx(of_table["nll_per_dim"], abs=1e-3), method
+            assert found["motions"] == fold["rows"], method
+            assert found["nees_dof"] == pytest.approx(of_table["nees_dof"]["joint"], rel=1e-3), method
+            assert found["nll_per_dim"] == pytest.approx(of_table["nll_per_dim"], abs=1e-3), method
 
 
 def test_statements_of_a_run_that_nothing_was_left_out_for_are_refused(tmp_path: Path) -> None:

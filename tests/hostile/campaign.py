@@ -169,7 +169,7 @@ def read_stated_motions(path: Path) -> None:
     from gpvo.evaluation.score import score_sequence
 
     score = score_sequence(path / "stated.txt", path / "truth.txt")
-    assert np.isfinite([score.nll_per_dim, score.energy_rotation_rad]).all(), "a score that is none"
+    assert np.isfinite([score["nll_per_dim"], score["energy_rotation_rad"]]).all(), "a score that is none"
 
 
 def read_live_state(path: Path) -> None:
