@@ -242,8 +242,8 @@ def _print_table(document: dict[str, Any]) -> None:
         say(f"motions in which odometry and truth differ far more than elsewhere: {odd}")
         say("('gpvo evaluate' lists them; 'gpvo train --odd drop' trains and scores without them)")
     slips = [f["slips"] for f in document["folds"] if "slips" in f]
-    if any(sum(s[k] for k in ("caught", "missed", "falsely_flagged")) for s in slips):
-        total = {k: sum(s[k] for s in slips) for k in ("caught", "missed", "falsely_flagged")}
+    total = {k: sum(s[k] for s in slips) for k in ("caught", "missed", "falsely_flagged")}
+    if any(total.values()):
         counted_in = (
             f"{method} {sum(s['nees_dof_with_slips'][method] for s in slips) / len(slips):.3g}"
             for method in ("learned", "constant")

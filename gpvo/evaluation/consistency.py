@@ -119,9 +119,9 @@ def consistency(
     if noise is not None:
         # From here on, errors are those of odometry and of the truth.
         C = C + noise[1][stated, :d, :d]
-    with_noise = nees_by_block(e, C, axes)
     scores = score(errors.xi[stated], statement.mean[index], C, statement.nu, axes)
-    energy = {unit: _energy(e, C, axes[np.isin(axes, BLOCKS[block])]) for unit, block in UNITS.items()}
+    by_unit = {unit: axes[np.isin(axes, BLOCKS[block])] for unit, block in UNITS.items()}
+    energy = {u: float(energy_score(e[:, a], marginal(C, a)).mean()) if len(a) else None for u, a in by_unit.items()}
     e, C = e[:, axes], marginal(C, axes)
     quartiles = by_difficulty(e, C)
     final, independent = _final_errors(statement, log, known)
@@ -135,7 +135,7 @@ def consistency(
         count=int(stated.sum()),
         axes=tuple(axes.tolist()),
         nees_dof={n: block_bootstrap(per_block[n]) if n in per_block else None for n in BLOCKS},
-        nees_dof_truth_noise={n: float(np.mean(with_noise[n])) if n in with_noise else None for n in BLOCKS},
+        nees_dof_truth_noise=scores["nees_dof"],
         **{name: scores[name] for name in _SCORED},
         energy=energy,
         correlation_gain_nats=float(correlation_gain(e, C).mean()),
@@ -145,11 +145,6 @@ def consistency(
         one_second=over(progress[1], 1.0) if d == 6 else None,
         horizons=tuple(over(progress[0], m) for m in HORIZONS_M if d == 6),
     )
-
-
-def _energy(error: Array, covariance: Array, axes: NDArray[np.intp]) -> float | None:
-    """Mean energy score over some of the axes, None for none."""
-    return float(energy_score(error[:, axes], marginal(covariance, axes)).mean()) if len(axes) else None
 
 
 def _final_errors(statement: Statement, log: VoLog, known: NDArray[np.bool_]) -> tuple[float | None, float | None]:

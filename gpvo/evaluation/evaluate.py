@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from functools import cached_property, partial
+from functools import cached_property
 from pathlib import Path
 
 import numpy as np
@@ -60,19 +60,14 @@ class EvaluateOptions:
 
 @dataclass(frozen=True)
 class Evaluation:
-    """Everything said of one run. ``covered``: frames with truth; ``T_est`` and ``T_true`` (N, 4, 4) with the first
-    poses made equal. ``unscored``: motions left out of errors and consistency, as the truth moves while the vehicle
-    stands, or jumps. ``odd``: these jumps, and stretches in which odometry and truth differ far more than elsewhere.
-    ``truth_sigma`` (6,): noise of the truth's poses by axis, as counted in, root mean square over the run;
-    ``truth_sigma_stated`` (6,): as its source states; ``truth_jitter_s``: jitter of its stamps, of which the former
-    holds what it makes of the poses; ``truth_noise`` (M, 6, 6): what both add to the errors, None for nothing.
-    ``tells_from_m``: length of path from which odometry's errors outweigh it. ``late_s``: offset between the clocks,
-    where it matters and none was given; ``turned``: a fixed rotation between truth and odometry, likewise; ``inverse``:
-    poses of one of the two seem to be inverse; ``unlike``: how little the two resemble each other, where they do not.
-    ``in_domain``: share of the measured motions that lie in the model's training domain, None without any or a
-    model.
-    ``misfits``: why else the model does not fit the run, or cannot be judged by it. ``poses``: scores of the
-    covariances of poses that a log states.
+    """Everything said of one run; what scripts read of it is explained there, by
+    :func:`gpvo.evaluation.document.document`.
+
+    ``covered``: frames with truth; ``T_est`` and ``T_true`` (N, 4, 4) with the first poses made equal. ``truth_sigma``,
+    ``truth_sigma_stated`` (6,): by axis; ``truth_noise`` (M, 6, 6): what the truth's noise and the jitter of its stamps
+    add to the errors, None for nothing. ``late_s``: offset between the clocks, where it matters and none was given;
+    ``turned``: a fixed rotation between truth and odometry, likewise. ``unscored``: motions left out of errors and
+    consistency. ``misfits``: why else the model does not fit the run, or cannot be judged by it.
     """
 
     run: Run
@@ -176,15 +171,10 @@ def evaluate_run(
     T_est = log.trajectory()
     made = statements(log, predictions, predictor, further)
     by_velocity = velocity_path(truth, log.t_ns) if options.truth_sigma is None else None
-    judge = partial(
-        consistency,
-        errors=errors,
-        log=scored,
-        T_true=T_true,
-        known=known,
-        noise=added,
-        by_velocity=by_velocity,
-    )
+
+    def judge(statement: Statement) -> Consistency | None:
+        return consistency(statement, errors, scored, T_true, known, added, by_velocity)
+
     found = list(map(judge, made))  # each statement is let go before the next
     first = int(np.flatnonzero(known)[0])
     number = np.arange(len(log)) + np.cumsum(in_waits(log, [s.t_ns for s in leaps]))  # no window over a jump is whole

@@ -1,5 +1,4 @@
-"""Runs as filters take them: with what is predicted of them, the truth's noise, and constants from their errors; a twin
-on a path that a vehicle can fly, with an IMU of this path."""
+"""Runs as filters take them: with what is predicted of them, the truth's noise, and constants from their errors."""
 
 from __future__ import annotations
 
@@ -71,19 +70,14 @@ def start_sigmas(runs: Sequence[Run]) -> StartSigmas:
     """Initial covariance that is no smaller than the noise of the truth it starts from, as poses or as their slope; of
     a tiny rig the position is as exact as beside any baseline."""
     baseline_m = min((r.log.camera.baseline_m for r in runs if r.log.camera), default=np.inf)
-    base = StartSigmas()
-    base = replace(base, position_m=min(base.position_m, _POSITION_BASELINES * baseline_m))
-    known = [(r.truth, float(np.median(np.diff(r.log.t_ns))) * 1e-9) for r in runs if r.truth and len(r.log) > 1]
-    position = max((truth.sigma_translation_m for truth, _ in known), default=0.0)
-    velocity = max((slope_sigma(truth.sigma_translation_m, dt_s) for truth, dt_s in known), default=0.0)
-    rotation = max((truth.sigma_rotation_rad for truth, _ in known), default=0.0)
-    return replace(
-        base,
-        position_m=max(base.position_m, position),
-        velocity_mps=max(base.velocity_mps, velocity),
-        tilt_rad=max(base.tilt_rad, rotation),
-        yaw_rad=max(base.yaw_rad, rotation),
-    )
+    sigmas = StartSigmas()
+    sigmas = replace(sigmas, position_m=min(sigmas.position_m, _POSITION_BASELINES * baseline_m))
+    for truth, log in ((r.truth, r.log) for r in runs if r.truth and len(r.log) > 1):
+        noise_m, noise_rad = truth.sigma_translation_m, truth.sigma_rotation_rad
+        velocity_mps = slope_sigma(noise_m, float(np.median(np.diff(log.t_ns))) * 1e-9)
+        least = {"position_m": noise_m, "velocity_mps": velocity_mps, "tilt_rad": noise_rad, "yaw_rad": noise_rad}
+        sigmas = replace(sigmas, **{name: max(getattr(sigmas, name), sigma) for name, sigma in least.items()})
+    return sigmas
 
 
 def constants_of(runs: Sequence[Run]) -> Constants:

@@ -21,6 +21,7 @@ from gpvo.dataset.errors import (
 from gpvo.dataset.misread import GROSS_DEG, FixedRotation, Resemblance
 from gpvo.dataset.truth_noise import made_from_odometry
 from gpvo.evaluation.consistency import BY_MODEL, Consistency, Horizon
+from gpvo.learning.methods import STATED
 from gpvo.online.features import AXES
 from gpvo.online.slip import flag_slips
 from gpvo.stats.consistency import seen_axes
@@ -109,7 +110,7 @@ def _of_motions(e: Evaluation, judged: Mapping[str, Consistency]) -> Verdict:
     wrong = told.wrong()
     outside = e.in_domain is not None and e.in_domain < ENOUGH_INSIDE
     misfit = bool(e.misfits) and told.c.method == "learned"
-    shown = dict.fromkeys((told.c.method, best, *(m for m in judged if m in _ALWAYS)))
+    shown = dict.fromkeys((told.c.method, best, *(m for m in judged if m in STATED)))
     lines = [*_conditions(e), *(found[m].line() for m in shown)]
     if not wrong and not outside:
         where = "per motion; over a second or a distance, nothing can be judged"
@@ -132,9 +133,6 @@ def _of_motions(e: Evaluation, judged: Mapping[str, Consistency]) -> Verdict:
     if outside:
         headline += "; the model does not know these conditions"
     return Verdict("red" if outside or "overconfident" in headline else "amber", headline + ".", tuple(lines))
-
-
-_ALWAYS = ("triangulation", "pointing_matching", "imported")
 
 
 def _nees(c: Consistency, block: str = "joint") -> float:
