@@ -124,7 +124,6 @@ class FusedRun:
     nis: Array
     counts: Mapping[str, int]
     scores: metrics.Scores
-    note: str = ""
 
     @property
     def T_world_imu(self) -> Array:
@@ -251,7 +250,6 @@ def fuse_flight(
         nis=nis,
         counts={**timeline.counts, "rejected": failed},
         scores=metrics.without_truth(nis, failed),
-        note=start.note,
     )
     return replace(run, scores=_score(flight, run, rows, start.world_tilt)) if flight.has_truth else run
 

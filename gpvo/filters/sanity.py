@@ -364,12 +364,9 @@ def _rises_together(jerk: Array, slope: Array, M: Array) -> float:
     """Correlation of VO's jerk with the slope of the force whose axes M renames."""
     # No window counts for more than three usual ones: in some VO may have failed.
     both = jerk, np.einsum("mcij,ij->mc", slope, M)
-    a, b = (v / np.maximum(np.linalg.norm(v, axis=1), 3 * _usual(v))[:, None] for v in both)
+    sizes = [np.linalg.norm(v, axis=1) for v in both]
+    a, b = (v / np.maximum(n, 3 * (np.median(n) + 1e-300))[:, None] for v, n in zip(both, sizes, strict=True))
     return float((a * b).sum() / np.sqrt((a**2).sum() * (b**2).sum() + 1e-300))
-
-
-def _usual(v: Array) -> float:
-    return float(np.median(np.linalg.norm(v, axis=1))) + 1e-300
 
 
 def _describe(M: Array) -> str:

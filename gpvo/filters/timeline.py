@@ -218,7 +218,8 @@ class Timeline:
             self.counts["too_late"] += 1  # by the clock of before, unless such records go on coming
             return []
         self._set_back_ns = None
-        if t_ns <= self.t_ns and self._already_seen(t_ns):
+        known = t_ns <= self.t_ns and (t_ns == self._newest_ns or any(e.t_record_ns == t_ns for e in self._history))
+        if known:
             self.counts["repeated"] += 1
             return []
         if self._jumps_ahead(t_ns):
@@ -240,9 +241,6 @@ class Timeline:
             return not self._doubt.is_settled_by(t_ns, follows)
         self._doubt.clear()
         return False
-
-    def _already_seen(self, t_ns: int) -> bool:
-        return t_ns == self._newest_ns or any(e.t_record_ns == t_ns for e in self._history)
 
     def latest(self, t_ns: int | None = None) -> ErrorStateFilter:
         """The filter carried forward to ``t_ns`` (default: the newest IMU sample), leaving this one where it is."""
