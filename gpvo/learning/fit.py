@@ -131,7 +131,8 @@ def fit_variance(
     level = np.zeros_like(rows.group) if between else rows.group
     C = rows.select(base_columns(choice.method, choice.residual))
     terms = parts(np.where(np.isfinite(C), C, np.nanmedian(C, axis=0)), rows.dt_s)
-    U = _gp_inputs(rows, inputs)
+    X = rows.select(inputs)
+    U = learn_domain(X).locate(X).inside if inputs else X  # as the predictor sees them
     fold = group_folds(rows.group, MOST_FOLDS)
     kept = [np.ones(len(terms), dtype=bool), *(fold != f for f in np.unique(fold))]
     means = means or [fit_coefficients(terms[of], rows.error[of], rows.weight[of]) for of in kept]
@@ -161,11 +162,3 @@ def _fit(
 def _losses(rows: Rows, model: VarianceModel) -> Array:
     """(G,) heavy-tailed negative log-likelihood per axis of each group left out [nats]."""
     return rows.by_group(negative_log_likelihood(rows.error**2, model.oof)).mean(axis=1)
-
-
-def _gp_inputs(rows: Rows, inputs: Sequence[str]) -> Array:
-    """(n, d) standardised and drawn into the domain, as the predictor sees them."""
-    if not inputs:
-        return np.zeros((len(rows.error), 0))
-    X = rows.select(inputs)
-    return learn_domain(X).locate(X).inside

@@ -60,18 +60,14 @@ def draw_sample(sets: Sequence[TrainingSet], columns: Sequence[str], method: str
     wanted = SAMPLE_ROWS // _LEAST_PER_SEQUENCE
     chosen = np.unique(np.linspace(0, len(sets) - 1, min(len(sets), wanted)).round().astype(int))
     each = SAMPLE_ROWS // len(chosen)
-    X, sequence, dt_s, geometry = [], [], [], []
+    parts = []
     for i in chosen.tolist():
-        s = sets[i]
-        at = _leading_on(s)
+        s, at = sets[i], _leading_on(sets[i])
         rows = at[np.unique(np.linspace(0, len(at) - 1, min(len(at), each)).round().astype(int))]
-        X.append(s.select(columns)[rows])
-        sequence.append(np.full(len(rows), i, dtype=np.int32))
-        dt_s.append(s.dt_s[rows])
-        if method is not None:
-            geometry.append(s.covariances[method][rows])
-    joined = np.concatenate(geometry) if geometry else None
-    return TrainingSample(np.concatenate(X), np.concatenate(sequence), np.concatenate(dt_s), joined)
+        stated = [] if method is None else [s.covariances[method][rows]]
+        parts.append((s.select(columns)[rows], np.full(len(rows), i, dtype=np.int32), s.dt_s[rows], *stated))
+    X, sequence, dt_s, *geometry = (np.concatenate(of_all) for of_all in zip(*parts, strict=True))
+    return TrainingSample(X, sequence, dt_s, geometry[0] if geometry else None)
 
 
 def _leading_on(s: TrainingSet) -> NDArray[np.int64]:
