@@ -53,6 +53,7 @@ from gpvo.types import STANDARD_GRAVITY_MPS2, Array, ImuNoise, MotionError
 
 _POSE = np.array([0, 1, 2, 6, 7, 8])  # position and attitude inside the core
 _STATE = CLONE.stop  # core and clone; what follows is VO's
+_CARRIED = slice(0, BA.start)  # what the error of the attitude is carried with
 _MOST_SPEED_VAR, _MOST_ANGLE_VAR = 100.0, 0.1  # (10 m/s)^2, (18 deg)^2: no state is doubted beyond
 _SPOILT, _SMALL, _ROUNDINGS = 0.01, 1e-3, 64.0  # share of a variance that rounding may be; how many roundings add up
 _UNSEEN_TURN_RAD, _UNSEEN_TILT_RAD = 1.0, 0.2  # about and from the vertical, while nothing is heard
@@ -106,6 +107,9 @@ class ErrorStateFilter:
         self._H = np.zeros((self.batch, 6, JOINT))
         self._H[:, :, JITTER_CUR] = np.eye(6)
         self._FP = np.empty((self.batch, CORE, JOINT))
+        # Of many members, an array like the covariance is larger than what memory is kept for from one to the next, and
+        # to fetch it takes longer than to fill it. Nothing stays in it, so copies share it.
+        self._room = np.empty_like(self.P)
         self._Q: tuple[float, Array] = (-1.0, np.zeros((CORE, CORE)))
         self.clone()
 
@@ -137,15 +141,17 @@ class ErrorStateFilter:
     def _propagate_covariance(self, dt: float) -> None:
         if self._Q[0] != dt:
             self._Q = (dt, process_noise(self._densities, dt, self._with_imu))
-        FP = np.matmul(self._F, self.P[:, :CORE, :], out=self._FP)
-        core = FP[:, :, :CORE] @ transpose(self._F)
+        # The biases stay as they are, and so does what is known of them and of the rest.
+        np.matmul(self._F[:, _CARRIED], self.P[:, :CORE], out=self._FP[:, _CARRIED])
+        self._FP[:, _CARRIED.stop :] = self.P[:, _CARRIED.stop : CORE]
+        core = self._FP[:, :, :CORE] @ transpose(self._F)
         core += transpose(core)
         core *= 0.5
         core += self._Q[1]
         self.P[:, :CORE, :CORE] = core
-        rest = FP[:, :, CORE:KEPT]
-        self.P[:, :CORE, CORE:KEPT] = rest
-        self.P[:, CORE:KEPT, :CORE] = transpose(rest)
+        rest = self._FP[:, _CARRIED, CORE:KEPT]
+        self.P[:, _CARRIED, CORE:KEPT] = rest
+        self.P[:, CORE:KEPT, _CARRIED] = transpose(rest)
 
     def doubt_readings(self, sigma: Array) -> None:
         """Widen by constant errors of the readings, gyroscope first, of standard deviations ``sigma`` (6,) [rad/s,
@@ -291,9 +297,15 @@ class ErrorStateFilter:
 
     def _joseph(self, K: Array, H: Array, PHt: Array, R: Array) -> None:
         """``A P A^T + K R K^T`` with ``A = I - K H``, which is never formed: its rank is that of the measurement."""
-        AP = self.P - K @ transpose(PHt)
-        new = AP + (K @ R - AP @ transpose(H)) @ transpose(K)
-        self.P = 0.5 * (new + transpose(new))
+        AP = np.subtract(self.P, K @ transpose(PHt), out=self._room)
+        new = (K @ R - AP @ transpose(H)) @ transpose(K)
+        new += AP
+        self._keep(new)
+
+    def _keep(self, P: Array) -> None:
+        """The mean of ``P`` and its transpose becomes the covariance."""
+        np.add(P, transpose(P), out=self._room)
+        np.multiply(self._room, 0.5, out=self.P)
 
     def inject(self, passed: NDArray[np.bool_] | None = None) -> None:
         """Move the error's mean into the estimate and carry the covariance there.
@@ -308,7 +320,7 @@ class ErrorStateFilter:
         dx, x = self.dx, self.x
         (E, J), (E_clone, J_clone) = (se3.so3_exp_and_right_jacobian(dx[:, block]) for block in (TH, me.CLONE_TH))
         sound = np.ones(self.batch, bool) if passed is None else passed
-        G = np.broadcast_to(np.eye(JOINT), self.P.shape).copy()
+        G = np.tile(np.eye(_STATE), (self.batch, 1, 1))
         of_state, of_clone = (
             (TH, x.R_world_imu, E, J, (P, V)),
             (me.CLONE_TH, self.clone_R, E_clone, J_clone, (CLONE_P,)),
@@ -326,8 +338,12 @@ class ErrorStateFilter:
         self.clone_R = _orthonormalised(self.clone_R @ E_clone)
         self.jitter_mean = self.jitter_mean + dx[:, JITTER_REF]
         self.jitter_cur_mean = dx[:, JITTER_CUR].copy()
-        self.P = G @ self.P @ transpose(G)
-        self.P = 0.5 * (self.P + transpose(self.P))
+        # Of all others, what is carried is what was.
+        for block in (_CARRIED, CLONE):
+            self.P[:, block] = G[:, block, block] @ self.P[:, block]
+        for block in (_CARRIED, CLONE):
+            self.P[:, :, block] = self.P[:, :, block] @ transpose(G[:, block, block])
+        self._keep(self.P)
         dx[:] = 0.0
 
     def clone(self, *, measured: bool = False) -> None:
