@@ -108,11 +108,12 @@ class Poses:
         """
         rows, ends, to_end = windows.rows, [0, -1], windows.to_end
         at_both = _carried(to_end[:, ends], jitter[rows[:, ends]])
-        whites, roots = _carried(to_end, white[rows]), to_end @ root[rows]
-        bias, calibration = roots[..., :6], roots[..., 6:]
+        whites, bias = _carried(to_end, white[rows]), to_end @ root[..., :6][rows]
         phis = np.broadcast_to(phi, (*rows.shape, len(phi)))
         added = whites.sum(axis=1) + persistent_sum(bias, phis[..., :6])
-        lasting = persistent_sum(calibration, phis[..., 6:]) if calibration.any() else np.zeros_like(added)
+        lasting = np.zeros_like(added)
+        if root[..., 6:].any():  # mostly, no part of the errors is the calibration's
+            lasting = persistent_sum(to_end @ root[..., 6:][rows], phis[..., 6:])
         at_ends = whites[:, ends] + bias[:, ends] @ np.swapaxes(bias[:, ends], -1, -2)
         summed = (to_end @ error[rows][..., None]).sum(axis=1)[..., 0]
         return cls(windows, summed, 0.5 * at_both.sum(axis=1) + lasting, added, 0.5 * at_ends.sum(axis=1))
@@ -126,5 +127,5 @@ class Poses:
 
 
 def _carried(adjoint: Array, C: Array) -> Array:
-    """Covariances (..., 6, 6), carried by adjoints (..., 6, 6)."""
-    return np.asarray(adjoint @ C @ np.swapaxes(adjoint, -1, -2))
+    """Covariances (w, m, 6, 6), carried by adjoints (w, m, 6, 6) to the end of each window, where one motion is."""
+    return C if C.shape[1] == 1 else np.asarray(adjoint @ C @ np.swapaxes(adjoint, -1, -2))
