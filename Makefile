@@ -20,7 +20,6 @@ PIP := $(BIN)/python -m pip install --quiet --no-compile --disable-pip-version-c
 
 .venv/demo-ready: .venv/pip-ready pyproject.toml constraints.txt
 	@echo "setting up .venv (a few minutes, once)"
-	$(PIP) torch
 	$(PIP) --editable '.[train,sim]'
 	@touch $@
 
