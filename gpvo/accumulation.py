@@ -71,27 +71,31 @@ def between_ends(T_last_cur: Array, last: MotionError, error: MotionError, dt_s:
 
 def measured(record: VoRecord, method: str) -> MotionError:
     """The error of a record's motion by one of its covariances. Raises KeyError where it has none of this name."""
+    if not record.shared:
+        return MotionError.independent(record.covariances[method], dt_s=record.dt_s)
     shared = sum(record.shared.values(), np.zeros((6, 6)))
     return with_shared(record.covariances[method], shared, record.T_prev_cur, dt_s=record.dt_s)
 
 
-def with_shared(covariance: Array, shared: Array, T_prev_cur: Array, *, dt_s: float = 0.0) -> MotionError:
-    """An error of this covariance (6, 6), of which ``shared`` (6, 6) comes from what all motions have in common.
+def with_shared(covariance: Array, shared: Array, T_prev_cur: Array, *, dt_s: float | Array = 0.0) -> MotionError:
+    """Errors of this covariance (..., 6, 6), of which ``shared`` (..., 6, 6) comes from what motions have in common.
 
     A wrong calibration makes the same error of all motions in one direction, and the opposite one of the way back: to
     first order it bends the scene, and motion is in proportion. So the translation's shared error has a vector for each
     direction of motion, and the rotation's goes with it; the rest of the rotation's counts as white.
     """
-    length = float(np.linalg.norm(T_prev_cur[:3, 3]))
-    if not (length > 0.0 and shared.any()):
-        return MotionError.independent(covariance, dt_s=dt_s)
-    root = scaled_root(shared[:3, :3])
-    both = np.concatenate([root, np.linalg.lstsq(root, shared[:3, 3:], rcond=None)[0].T])
+    t = T_prev_cur[..., :3, 3]
+    length = np.linalg.norm(t, axis=-1)[..., None]
+    way = t / np.where(length > 0.0, length, 1.0)  # none at rest
+    root = scaled_root(shared[..., :3, :3])
+    turns = shared[..., 3:, :3] @ np.swapaxes(np.linalg.pinv(root), -1, -2)
+    both = np.concatenate([root, turns], axis=-2)
+    by_way = (both[..., :, None, :] * way[..., None, :, None]).reshape(*both.shape[:-1], 9)
     return MotionError(
-        mean=np.zeros(6),
-        jitter=np.zeros((6, 6)),
-        white=symmetrise(covariance - both @ both.T),
-        persistent_root=np.kron(T_prev_cur[:3, 3] / length, both),
+        mean=np.zeros(t.shape[:-1] + (6,)),
+        jitter=np.zeros_like(covariance),
+        white=symmetrise(covariance - by_way @ np.swapaxes(by_way, -1, -2)),
+        persistent_root=by_way,
         persistent_tau_s=np.full(9, np.inf),
         dt_s=dt_s,
     )

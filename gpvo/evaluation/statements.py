@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
-from functools import cache, partial
+from functools import cache, lru_cache, partial
 from typing import TYPE_CHECKING, Any, Generic, TypeVar
 
 import numpy as np
@@ -118,12 +118,22 @@ def plain_statement(log: VoLog, method: str, covariance: Array, shared: Array | 
     T = np.zeros((0, 4, 4)) if shared is None else log.T_prev_cur
 
     def held(k: int) -> MotionError:
-        C = _NOTHING if source[k] < 0 else covariance[source[k]]
-        if shared is None or vouched[k] < 0 or not usable[k]:
-            return MotionError.independent(C, dt_s=float(dt_s[k]))
-        return with_shared(C, shared[k], T[k], dt_s=float(dt_s[k]))
+        return MotionError.independent(_NOTHING if source[k] < 0 else covariance[source[k]], dt_s=float(dt_s[k]))
 
-    return Statement(method, mean, covariance, _Rows(held, len(log)))
+    def some(block: int) -> MotionError:
+        assert shared is not None
+        rows = slice(block * _AT_ONCE, (block + 1) * _AT_ONCE)
+        known = np.where((usable & (vouched >= 0))[rows, None, None], shared[rows], 0.0)
+        C = np.where(source[rows, None, None] < 0, _NOTHING, covariance[source[rows]])
+        return with_shared(C, known, T[rows], dt_s=dt_s[rows])
+
+    return Statement(method, mean, covariance, _Rows(held if shared is None else _of_blocks(some), len(log)))
+
+
+def _of_blocks(made: Callable[[int], MotionError]) -> Callable[[int], MotionError]:
+    """Row k of batches of a thousand, the last few of which are kept: windows ask for the same motions many times."""
+    kept = lru_cache(maxsize=4)(made)
+    return lambda k: kept(k // _AT_ONCE).row(k % _AT_ONCE)
 
 
 @dataclass(frozen=True)
