@@ -17,7 +17,7 @@ from gpvo.vo.config import VoConfig
 from gpvo.vo.felt import Felt
 from gpvo.vo.frontend import Observation
 from gpvo.vo.motion import NO_TWIST
-from gpvo.vo.rivals import EXPLAINED, LONGEST_DOUBT_NS, Choice, Expected, Horizon, Leaps, Standing
+from gpvo.vo.rivals import EXPLAINED, LONGEST_DOUBT_NS, SUREST, Choice, Expected, Horizon, Leaps, Standing
 
 _RIVAL_STAYS = 0.85  # per frame
 _SEVERAL = 1.5  # of the running sum: a second motion that was found time and again
@@ -226,9 +226,12 @@ class State:
     def unseen(self, share: float, expected: Expected | None, *, goes_on: bool) -> float:
         """Probability that the scene's motion is none that was seen, beside one that explains this share of the image;
         it is as likely to be another one that was."""
+        return 0.5 * self.standing.wrong(share, goes_on=goes_on, felt=self._confirmed(expected, goes_on=goes_on))
+
+    def _confirmed(self, expected: Expected | None, *, goes_on: bool) -> float:
+        """How far an IMU that says the same as the motion is to be trusted, from 0 to 1."""
         agrees = goes_on and expected is not None and expected.felt and self.leaps.before is None
-        felt = self.felt.proven if agrees and self.felt is not None else 0.0
-        return 0.5 * self.standing.wrong(share, goes_on=goes_on, felt=felt)
+        return self.felt.proven if agrees and self.felt is not None else 0.0
 
     def follow(
         self, t_ns: int, T_ref_cur: Array, share: float, expected: Expected | None, max_acceleration_mps2: float, *,
@@ -246,7 +249,7 @@ class State:
             wrongly = 1.0 if self.felt is None else 1.0 - self.felt.proven
             sigmas_mps = self._sigmas_since_mps(self.t_refused_ns, t_ns, max_acceleration_mps2)
             was = self._instead(t_ns, T_ref_cur, self.refused, max(wrongly * sigmas_mps[0], min(sigmas_mps)))
-            C = C + was / (1.0 + np.exp(self.odds))
+            C = C + was / (1.0 + np.exp(self.odds + SUREST * self._confirmed(expected, goes_on=goes_on)))
         self.standing.follow(share, twist, step_s, goes_on=goes_on)
         return C
 

@@ -82,6 +82,11 @@ def test_beside_a_rival_a_velocity_that_was_refused_may_be_the_scene_s():
     error = np.array([0.0, 0.02, -1.8, 0.0, 0.006, 0.0])  # the street's velocity now, which is not quite that of then
     assert error[:3] @ np.linalg.solve(C[:3, :3], error[:3]) < 25.0
     assert np.sqrt(C[4, 4]) > 0.2 * 0.1 * 0.1
+    state.place_imu(np.eye(4))
+    state.felt.wrong = np.array([0.0, 1.0])  # it has felt every change of velocity rightly, and confirms this one
+    confirmed = replace(expecting(0.0, 3.0), felt=True)
+    felt = state.follow(83 * seconds // 10, np.eye(4), 0.9, confirmed, 12.0, goes_on=True)
+    assert felt[2, 2] < 0.1 * C[2, 2]
 
 
 def test_a_leap_is_in_doubt_until_one_leads_back_or_it_has_lasted_as_long():
