@@ -48,6 +48,14 @@ def flight(tmp_path_factory):
     return fly(tmp_path_factory.mktemp("flight"), 3)
 
 
+@pytest.fixture(scope="module")
+def flown(tmp_path_factory):
+    """The same flight, as a run that is read from its folder."""
+    folder = tmp_path_factory.mktemp("flown")
+    run(open_source(simulate_points("tunnel-clean", 3, duration_s=8.0).save(folder / "flight.npz")), folder / "run")
+    return read_run(folder / "run")
+
+
 def seconds(log):
     return (log.t_ns - log.t_ns[0]) * 1e-9
 
@@ -170,10 +178,7 @@ def test_another_word_for_waits_is_refused(flight):
         build(*flight, name="a", waits="leave")
 
 
-def test_consistency_is_not_judged_by_such_a_truth_but_the_path_is(tmp_path):
-    source = open_source(simulate_points("tunnel-clean", 3, duration_s=8.0).save(tmp_path / "flight.npz"))
-    run(source, tmp_path / "run")
-    flown = read_run(tmp_path / "run")
+def test_consistency_is_not_judged_by_such_a_truth_but_the_path_is(flown, tmp_path):
     moved = replace(flown, truth=wandering(flown.truth, 0.2, 0.3, AT_REST_S))
     evaluations = [evaluate_run(r, options=EvaluateOptions(truth_sigma=(0.0, 0.0))) for r in (flown, moved)]
     exact, judged = document(evaluations)["runs"]
@@ -187,10 +192,7 @@ def test_consistency_is_not_judged_by_such_a_truth_but_the_path_is(tmp_path):
     assert of_files["nees_dof"] == pytest.approx(nees[1], rel=1e-3)
 
 
-def test_a_motion_over_the_whole_wait_is_not_scored_by_its_file_either(tmp_path):
-    source = open_source(simulate_points("tunnel-clean", 3, duration_s=8.0).save(tmp_path / "flight.npz"))
-    run(source, tmp_path / "run")
-    flown = read_run(tmp_path / "run")
+def test_a_motion_over_the_whole_wait_is_not_scored_by_its_file_either(flown, tmp_path):
     truth = wandering(flown.truth, 0.2, 0.3, AT_REST_S)
     ((first, last),) = wandering_waits(flown.log, truth)
     records = [replace(r, t_prev_ns=int(first)) if r.t_ns == last else r for r in flown.log.records]
