@@ -7,11 +7,13 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from gpvo.filters import measurement as me
+from gpvo.filters.eskf import ErrorStateFilter
 from gpvo.filters.policies import LearnedPolicy
 from gpvo.filters.propagation import (
     BA,
     BG,
     CORE,
+    DEFAULT_IMU_NOISE,
     TH,
     ConstantVelocityNoise,
     Nominal,
@@ -183,3 +185,35 @@ def test_motions_are_used_wherever_the_vehicle_may_be(sigma_m: float, precise: f
     turn = se3.so3_log(timeline.filter.x.R_world_imu[0].T @ flight.T_world_imu[-1, :3, :3])
     assert (np.abs(turn) < 4.0 * np.sqrt(variance[TH])).all()
     assert np.linalg.norm(timeline.filter.x.position[0] - flight.T_world_imu[-1, :3, 3]) < 2.0
+
+
+@pytest.mark.parametrize("passed", [(True, True, True), (True, False, True)])
+def test_what_is_not_carried_or_moved_is_what_a_whole_transition_leaves(passed: tuple[bool, ...]) -> None:
+    """Of three members, against the products of whole matrices, of which most are nothing."""
+    rng = np.random.default_rng(4)
+    R = se3.so3_exp(rng.standard_normal((3, 3)))
+    x = Nominal(*rng.standard_normal((2, 3, 3)), R, *0.1 * rng.standard_normal((2, 3, 3)))
+    filter = ErrorStateFilter(x, np.eye(CORE), imu_noise=DEFAULT_IMU_NOISE)
+    A = rng.standard_normal((3, me.JOINT, me.JOINT))
+    A[:, me.JITTER_CUR] = 0.0  # as between two records
+    filter.P[:] = A @ A.swapaxes(1, 2)
+    before = filter.P.copy()
+    filter.propagate_imu(0.01, *rng.standard_normal((4, 3, 3)))
+    F = np.tile(np.eye(me.JOINT), (3, 1, 1))
+    F[:, :CORE, :CORE] = filter._F
+    Q = process_noise(imu_densities(DEFAULT_IMU_NOISE), 0.01, True)
+    before = F @ before @ F.swapaxes(1, 2)
+    before[:, :CORE, :CORE] += Q
+    np.testing.assert_allclose(filter.P, before, rtol=1e-9, atol=1e-12)
+
+    dx = filter.dx[:] = 0.1 * rng.standard_normal(filter.dx.shape)
+    G = np.tile(np.eye(me.JOINT), (3, 1, 1))
+    attitudes = (TH, filter.x.R_world_imu, (P, V)), (me.CLONE_TH, filter.clone_R, (me.CLONE_P,))
+    for k, (turned, R, moved) in ((k, of) for k in range(3) for of in attitudes):
+        turn, jacobian = se3.so3_exp_and_right_jacobian(dx[k, turned])
+        G[k, turned, turned] = turn.T if passed[k] else jacobian
+        for block in moved if passed[k] else ():
+            G[k, block, turned] = -se3.skew(dx[k, block]) @ R[k]
+    filter.inject(np.array(passed))
+    np.testing.assert_allclose(filter.P, G @ before @ G.swapaxes(1, 2), rtol=1e-9, atol=1e-12)
+    np.testing.assert_array_equal(filter.P, filter.P.swapaxes(1, 2))
