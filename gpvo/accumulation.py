@@ -87,9 +87,8 @@ def with_shared(covariance: Array, shared: Array, T_prev_cur: Array, *, dt_s: fl
     t = T_prev_cur[..., :3, 3]
     length = np.linalg.norm(t, axis=-1)[..., None]
     way = t / np.where(length > 0.0, length, 1.0)  # none at rest
-    root = scaled_root(shared[..., :3, :3])
-    turns = shared[..., 3:, :3] @ np.swapaxes(np.linalg.pinv(root), -1, -2)
-    both = np.concatenate([root, turns], axis=-2)
+    # The root of the translation's part, and the turn that goes with it; without axes in which it is as good as none.
+    both = shared[..., :3] @ np.swapaxes(np.linalg.pinv(scaled_root(shared[..., :3, :3]), 1e-3), -1, -2)
     by_way = (both[..., :, None, :] * way[..., None, :, None]).reshape(*both.shape[:-1], 9)
     return MotionError(
         mean=np.zeros(t.shape[:-1] + (6,)),
@@ -137,10 +136,7 @@ class PoseError:
         return few
 
     def after(self, T_prev_cur: Array, error: MotionError) -> PoseError:
-        """The error of the pose after a motion ``T_prev_cur`` (..., 4, 4) of this error; several may start here.
-
-        Raises ValueError where the persistent vector has another length than before.
-        """
+        """The error of the pose after a motion ``T_prev_cur`` (..., 4, 4) of this error; several may start here."""
         if not (self._jitter_known or error.lost):
             # The first motion that starts here says how noisy this frame is.
             self._P[..., _N, _N] = first_jitter(T_prev_cur, error.jitter)
@@ -176,14 +172,12 @@ class PoseError:
         if P == 0:
             self._unaged_s = elapsed_s
             return np.zeros((6, known)), np.ones(known)
-        if known == 0:
-            # It starts in its steady state.
+        if known != P:
+            # It starts in its steady state; of another one, as of another model, what it did to the pose remains.
             joint = np.zeros((*self._P.shape[:-2], _U + P, _U + P))
-            joint[..., :_U, :_U] = self._P
+            joint[..., :_U, :_U] = self._P[..., :_U, :_U]
             joint[..., range(_U, _U + P), range(_U, _U + P)] = 1.0
             self._P = joint
-        elif known != P:
-            raise ValueError(f"the persistent vector has {P} elements, and had {known}")
         self._unaged_s = np.zeros_like(elapsed_s)
         return error.persistent_root, persistence(elapsed_s, error.persistent_tau_s)
 
@@ -208,14 +202,15 @@ def over_windows(
 
 
 def stacked(errors: Sequence[MotionError]) -> MotionError:
-    """A batch of the errors, of the worst status among them; one without a persistent vector has a root of zero."""
+    """A batch of the errors, of the worst status among them. One without the persistent vector of the longest has a
+    root of zero, and what persists in it counts as white."""
     tau_s = max((e.persistent_tau_s for e in errors), key=len)
-    none = np.zeros((6, len(tau_s)))
+    none, has = np.zeros((6, len(tau_s))), [len(e.persistent_tau_s) == len(tau_s) for e in errors]
     return MotionError(
         mean=np.array([e.mean for e in errors]),
         jitter=np.array([e.jitter for e in errors]),
-        white=np.array([e.white for e in errors]),
-        persistent_root=np.array([e.persistent_root if len(e.persistent_tau_s) else none for e in errors]),
+        white=np.array([e.white if own else e.white + e.persistent for e, own in zip(errors, has, strict=True)]),
+        persistent_root=np.array([e.persistent_root if own else none for e, own in zip(errors, has, strict=True)]),
         persistent_tau_s=tau_s,
         dt_s=np.array([e.dt_s for e in errors]),
         status=max((e.status for e in errors), key=lambda status: status.severity),

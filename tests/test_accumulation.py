@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import tracemalloc
 from dataclasses import replace
+from itertools import pairwise
 
 import numpy as np
 import pytest
@@ -21,7 +22,7 @@ from gpvo.accumulation import (
     with_shared,
 )
 from gpvo.geometry import se3
-from gpvo.geometry.covariance import scaled_root
+from gpvo.geometry.covariance import is_positive_definite, scaled_root
 from gpvo.types import Array, MotionError, Status
 
 from motion_errors import motion_error
@@ -209,3 +210,37 @@ def test_what_is_shared_by_a_camera_at_rest_has_no_direction():
     error = with_shared(C, 0.5 * C, np.eye(4))
     assert not error.persistent.any()
     np.testing.assert_array_equal(error.covariance, C)
+
+
+def test_white_stays_a_covariance_where_the_shared_part_is_as_good_as_flat():
+    """Correlations to rounding pass as semidefinite; dividing by what they leave would not."""
+    shared = np.zeros((6, 6))
+    shared[:3, :3] = 1e-4 + np.diag([0.0, 1e-18, 0.0])
+    shared[3, 3], shared[1, 3] = 1e-6, 3e-5 * np.sqrt(1e-4 * 1e-6)
+    shared[3, 1] = shared[1, 3]
+    C = shared + np.diag(np.repeat([1e-7, 1e-9], 3))
+    T = np.eye(4)
+    T[:3, 3] = 0.1, 0.2, 0.3
+    error = with_shared(C, shared, T)
+    np.testing.assert_allclose(error.covariance, C, rtol=1e-9, atol=1e-15)
+    assert np.linalg.eigvalsh(error.white)[0] > 0.0
+
+
+@pytest.mark.parametrize("first", [9, 12])
+def test_statements_of_two_models_add_up_in_either_order(first):
+    """A prediction has another persistent vector than a geometric covariance, which stands in where it lacks."""
+    C, rng = _covariance(np.random.default_rng(1)), np.random.default_rng(2)
+    motions = [
+        replace(
+            MotionError.independent(C, dt_s=DT_S),
+            persistent_root=1e-3 * rng.normal(size=(6, P)),
+            persistent_tau_s=np.full(P, np.inf),
+        )
+        for P in (first, 21 - first)
+    ]
+    poses = [pose := PoseError()]
+    for error in (*motions, *motions):
+        poses.append(pose := pose.after(np.eye(4), error))
+    grown = [np.linalg.eigvalsh(b.covariance - a.covariance)[0] for a, b in pairwise(poses)]
+    assert min(grown) > 0.0
+    assert is_positive_definite(between_ends(np.eye(4), *motions, DT_S))

@@ -24,7 +24,7 @@ import numpy as np
 from gpvo import __version__
 from gpvo.errors import SourceError
 from gpvo.files import digest_of_file, write_json, write_toml
-from gpvo.geometry.covariance import are_covariances, from_upper, upper
+from gpvo.geometry.covariance import are_covariances, are_semidefinite, from_upper, upper
 from gpvo.io import run_folder, run_table
 from gpvo.io.parquet import RowGroup, join_tables, write_blocks, write_table
 from gpvo.io.run_folder import is_finished as is_finished
@@ -280,5 +280,6 @@ def as_stored(record: VoRecord) -> VoRecord:
     C = from_upper(upper(np.array(list(record.covariances.values())).reshape(-1, 6, 6)), 6)
     good = are_covariances(C) if record.usable else np.ones(len(C), bool)
     kept = {name: c for name, c, is_good in zip(record.covariances, C, good) if is_good}
-    shared = dict(zip(record.shared, from_upper(upper(np.array(list(record.shared.values())).reshape(-1, 6, 6)), 6)))
+    S = from_upper(upper(np.array(list(record.shared.values())).reshape(-1, 6, 6)), 6)
+    shared = dict(zip(record.shared, S)) if kept and are_semidefinite(S).all() else {}
     return replace(record, covariances=kept, shared=shared)

@@ -267,7 +267,8 @@ def check_log(log: VoLog, path: Path) -> None:
             C = C[stated]
             _check_covariances(C, f"{method} covariance", path, first=checked[method])
             if shared.any():
-                _check_covariances(C - shared[stated], f"{method} covariance, less what is shared,", path, semi=True)
+                less = f"{method} covariance, less what is shared,"
+                _check_covariances(C - shared[stated], less, path, semi=True, first=checked[method])
             checked[method] += len(C)
 
 
