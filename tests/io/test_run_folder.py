@@ -197,7 +197,7 @@ def test_digests_are_of_files_that_do_not_fit_into_memory(tmp_path):
 
 
 def test_parts_that_know_different_methods_make_one_log(tmp_path):
-    bare = [replace(r, covariances={}, v_t={}, stage_ms={}, n_tracked=-1) for r in make_records(90)[:30]]
+    bare = [replace(r, covariances={}, v_t={}, shared={}, stage_ms={}, n_tracked=-1) for r in make_records(90)[:30]]
     records = [*bare, *make_records(90)[30:60], *(replace(r, v_t={}) for r in make_records(90)[60:])]
     with RunWriter(tmp_path / "run", camera=CAMERA, chunk=30) as writer:
         for record in records:
