@@ -258,7 +258,7 @@ class RigError:
         of the translation's score, each column for another part of the noise. Covariance (6, 6) of two bodies."""
         rest = B - A @ (K := np.linalg.solve(A.T @ A, A.T @ B))
         information, score = (sums := rest.T @ rest)[:-1, :-1], sums[:-1, -1]
-        by_rig = float(sums[-1, -1] - score @ np.linalg.lstsq(information, score)[0])
+        by_rig = float(sums[-1, -1] - score @ np.linalg.lstsq(information, score, rcond=None)[0])
         if not self._apart.see(A, B[:, -1], by_rig):
             self._blocks[0].add(information, score + information @ self.state.mean[_DX], -K[:3, :-1].T @ dilution)
         return self._apart.otherwise
@@ -268,7 +268,7 @@ class RigError:
         all rows, which is no noise of single ones."""
         rows = self._camera.fy_px * by_dy
         off = row_error - self.state.mean[_DY] @ rows
-        off = np.abs(off - np.linalg.lstsq(rows[:3].T, off)[0] @ rows[:3])  # without a shift and a turn
+        off = np.abs(off - np.linalg.lstsq(rows[:3].T, off, rcond=None)[0] @ rows[:3])  # without a shift and a turn
         sigma = max(1.4826 * median(off), 0.05)
         weighted = rows * np.minimum(1.0, 2.5 * sigma / np.maximum(off, 1e-9)) / sigma**2
         self._blocks[1].add(weighted @ rows.T, weighted @ row_error)

@@ -31,7 +31,7 @@ _NOISE = 9.0  # standard deviations of odometry's own noise that are no change o
 _AREA = 0.5  # power of the parts covered in the odds of being the scene, frame by frame: neighbours tell the same
 _UNSEEN = -0.2  # log odds of the expected motion that nothing in the image makes
 _REMEMBERED_S = 4.0  # for so long the parts that a motion explained speak for it
-SUREST = 3.0  # log odds at most: whoever is surer could not be put right
+_SUREST = 3.0  # log odds at most: whoever is surer could not be put right
 _IN_FRONT = 1.5  # times as near as usual: the farthest points of what hides the scene
 LONGEST_DOUBT_NS = 30 * 10**9
 _REGAINED = 0.3  # log odds, with each frame in which nothing speaks against the motion
@@ -159,7 +159,7 @@ class Standing:
         says it is, is to be trusted, from 0 to 1."""
         now = _log_odds(share)
         before = self.before if goes_on and self.before is not None else now
-        return float(1 / (1 + np.exp(now + before + SUREST * felt)))
+        return wrong_by(now + before, felt)
 
     def unseen(self, twist: Array) -> Array:
         """Second moment (6, 6) about a velocity (6,) of those that the vehicle has had: it may have any of them where
@@ -179,6 +179,12 @@ class Standing:
 def _log_odds(share: float) -> float:
     p = min(max(share, 0.03), 0.97)  # of a few dozen parts
     return float(np.log(p / (1 - p)))
+
+
+def wrong_by(odds: float, felt: float) -> float:
+    """Probability that a motion of these log odds is not the scene's, if an IMU that says it is, is to be trusted so
+    far, from 0 to 1."""
+    return float(1 / (1 + np.exp(odds + _SUREST * felt)))
 
 
 def choose(
@@ -216,7 +222,7 @@ def choose(
     otherwise[:3, :3] += share @ np.square(np.where(np.isfinite(sigma_m), sigma_m, 0.0)) * np.eye(3)
     if len(candidates) > len(motions) and expected is not None:
         otherwise[3:, 3:] += share[-1] * expected.C_turn
-    return Choice(best, otherwise, plausible, plausible and bool(tells[best]), min(odds, SUREST), on)
+    return Choice(best, otherwise, plausible, plausible and bool(tells[best]), min(odds, _SUREST), on)
 
 
 def _weigh(

@@ -17,7 +17,7 @@ from gpvo.vo.config import VoConfig
 from gpvo.vo.felt import Felt
 from gpvo.vo.frontend import Observation
 from gpvo.vo.motion import NO_TWIST
-from gpvo.vo.rivals import EXPLAINED, LONGEST_DOUBT_NS, SUREST, Choice, Expected, Horizon, Leaps, Standing
+from gpvo.vo.rivals import EXPLAINED, LONGEST_DOUBT_NS, Choice, Expected, Horizon, Leaps, Standing, wrong_by
 
 _RIVAL_STAYS = 0.85  # per frame
 _SEVERAL = 1.5  # of the running sum: a second motion that was found time and again
@@ -249,7 +249,7 @@ class State:
             wrongly = 1.0 if self.felt is None else 1.0 - self.felt.proven
             sigmas_mps = self._sigmas_since_mps(self.t_refused_ns, t_ns, max_acceleration_mps2)
             was = self._instead(t_ns, T_ref_cur, self.refused, max(wrongly * sigmas_mps[0], min(sigmas_mps)))
-            C = C + was / (1.0 + np.exp(self.odds + SUREST * self._confirmed(expected, goes_on=goes_on)))
+            C = C + wrong_by(self.odds, self._confirmed(expected, goes_on=goes_on)) * was
         self.standing.follow(share, twist, step_s, goes_on=goes_on)
         return C
 
