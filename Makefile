@@ -1,6 +1,7 @@
 # make demo   set up and show the main job, in a few minutes
 # make test   set up and run lint, import contracts, types and tests; of these `make lint` runs all but the tests
 # make check  the longer tests: every README command, Monte Carlo, memory, pictures, a browser
+# make oldest the tests with the oldest versions that pyproject.toml allows, but for torch
 # make docs   the documentation, as pages in docs/_build
 # make dist   the source archive and the wheel, checked
 # make bench  speed and memory, as ratios within one run
@@ -11,7 +12,7 @@ BIN := .venv/bin
 export PYTHONDONTWRITEBYTECODE :=
 PIP := $(BIN)/python -m pip install --quiet --no-compile --disable-pip-version-check --constraint constraints.txt
 
-.PHONY: demo test lint tests check bench docs dist clean
+.PHONY: demo test lint tests check oldest bench docs dist clean
 
 .venv/pip-ready:
 	$(PYTHON) -m venv .venv
@@ -50,6 +51,16 @@ tests: .venv/test-ready
 check: .venv/test-ready
 	$(BIN)/python -m pytest -n 2 --dist worksteal -m slow $$(grep -rl --include='*.py' 'mark\.slow' tests | sort)
 
+# The newest patch of each; torch, of which others may bring CUDA along, as in constraints.txt.
+oldest:
+	$(PYTHON) -m venv .venv-oldest
+	sed -n '/^dependencies/,/^\[dependency/p' pyproject.toml | grep -oE '"[a-z0-9-]+>=[0-9.]+' | \
+	  sed -E 's/"(.*)>=(.*)/\1==\2.*/; /^torch==/d' > .venv-oldest/versions.txt
+	grep '^torch==' constraints.txt >> .venv-oldest/versions.txt
+	.venv-oldest/bin/python -m pip install --quiet --upgrade 'pip>=25.1'
+	.venv-oldest/bin/python -m pip install --quiet --constraint .venv-oldest/versions.txt --editable '.[all]' --group dev
+	OMP_NUM_THREADS=1 .venv-oldest/bin/python -m pytest -n 2 --dist worksteal -m "not slow"
+
 bench: .venv/test-ready
 	$(BIN)/python -m bench
 
@@ -65,4 +76,4 @@ dist: .venv/test-ready
 	$(BIN)/check-wheel-contents dist/*.whl
 
 clean:
-	rm -rf .venv out dist build .pytest_cache .mypy_cache .ruff_cache
+	rm -rf .venv .venv-oldest out dist build .pytest_cache .mypy_cache .ruff_cache

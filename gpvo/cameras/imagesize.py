@@ -48,15 +48,16 @@ def decoded(raw: NDArray[np.uint8], *, grey: bool = False) -> NDArray[Any] | Non
     import cv2
 
     kind = cv2.IMREAD_GRAYSCALE if grey else cv2.IMREAD_ANYDEPTH | cv2.IMREAD_ANYCOLOR
-    # Whoever asked reports a damaged image; OpenCV need not warn as well.
-    level = cv2.utils.logging.getLogLevel()
-    cv2.utils.logging.setLogLevel(cv2.utils.logging.LOG_LEVEL_SILENT)
+    # Whoever asked reports a damaged image; OpenCV (before 4.13, with functions of its own) need not warn as well.
+    log: Any = getattr(cv2.utils, "logging", cv2)
+    level = log.getLogLevel()
+    log.setLogLevel(0)
     try:
         return cv2.imdecode(raw, kind | cv2.IMREAD_IGNORE_ORIENTATION)
     except cv2.error:
         return None
     finally:
-        cv2.utils.logging.setLogLevel(level)
+        log.setLogLevel(level)
 
 
 def is_whole(raw: bytes | memoryview) -> bool:

@@ -10,7 +10,7 @@ from difflib import get_close_matches
 from functools import wraps
 from itertools import groupby
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, get_type_hints
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 from typer.core import TyperGroup
@@ -90,8 +90,7 @@ def _called(asking: Any, given: dict[str, Any]) -> Any:
 def _asked(asking: Any) -> list[tuple[str, Any, Any]]:
     """Name, type and default of each parameter that has a help or such parameters of its own, and of typer's context:
     no other field of a dataclass is an option."""
-    hints = get_type_hints(asking, include_extras=True)
-    found = [(name, hints[name], p.default) for name, p in inspect.signature(asking).parameters.items()]
+    found = [(p.name, p.annotation, p.default) for p in inspect.signature(asking, eval_str=True).parameters.values()]
     return [
         (name, kind, default)
         for name, kind, default in found

@@ -196,9 +196,11 @@ def bound_chunks() -> None:
     from rosbags.rosbag1 import reader as ros1
     from rosbags.rosbag2 import storage_mcap as mcap
 
-    of: dict[str, Callable[[], Any]] = {"bz2": bz2.BZ2Decompressor, "lz4": LZ4FrameDecompressor}
-    if hasattr(mcap, "zstd"):
-        of["zstd"] = mcap.zstd.ZstdDecompressor
+    of: dict[str, Callable[[], Any]] = {
+        "bz2": bz2.BZ2Decompressor,
+        "lz4": LZ4FrameDecompressor,
+        "zstd": mcap.zstd.ZstdDecompressor,
+    }
     # Versions of rosbags that have no such table are left as they are.
     for table in (getattr(ros1, "decompressors", {}), getattr(mcap, "DECOMPRESSORS", {})):
         table.update({name: partial(unpacked, new=of[name]) for name in of.keys() & table.keys()})
