@@ -66,7 +66,8 @@ class _Graph:
         """One node; numbers and arrays become constants."""
         name = out or f"v{len(self._nodes)}"
         named = [i if isinstance(i, str) else self.constant(i) for i in inputs]
-        self._nodes.append(self._onnx.helper.make_node(op, named, [name], **attributes))
+        # Named, as older versions of ONNX Runtime name what they fuse by it.
+        self._nodes.append(self._onnx.helper.make_node(op, named, [name], name=name, **attributes))
         return name
 
     def add(self, *values: str | float, out: str | None = None) -> str:
@@ -129,7 +130,9 @@ def _predict(g: _Graph, model: ErrorModel) -> None:
     sigmas = [g("Sqrt", g("Mul", rest, share)) for share in _shares(g, model, rest)]
     each = zip(PARTS, sigmas, _correlations(g, model), strict=True)
     jitter, white, bias = (g("Mul", g.outer(sigma), R, out=None if name == "bias" else name) for name, sigma, R in each)
-    parts = [jitter, white, g("Add", bias, g("MatMul", root, g("Transpose", root, perm=[0, 2, 1])), out="bias")]
+    # Not a product with the transpose: ONNX Runtime, to 1.23 at least, fuses these into one that it lacks for doubles.
+    square = g("Einsum", root, root, equation="nij,nkj->nik")
+    parts = [jitter, white, g("Add", bias, square, out="bias")]
     covariance = g.add(*parts, out="covariance")
     ln_det = g.add(*(g("Log", pivot) for pivot in _pivots(g, covariance)))
     g("Mul", base, 0.0, out="mean")

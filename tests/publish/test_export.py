@@ -168,6 +168,17 @@ def test_onnx_runs_to_the_same_numbers(case: str, tmp_path: Path) -> None:
     assert again.read_bytes() == path.read_bytes()
 
 
+@pytest.mark.parametrize("case", CASES)
+def test_onnx_asks_nothing_that_older_runtimes_fail_on(case: str, tmp_path: Path) -> None:
+    """To 1.20, they call what they fuse by the names of nodes; to 1.23, a product with a transpose is missing."""
+    onnx = pytest.importorskip("onnx")
+    to_onnx(CASES[case], tmp_path / "model.onnx")
+    nodes = onnx.load(tmp_path / "model.onnx").graph.node
+    assert len({node.name for node in nodes} - {""}) == len(nodes)
+    transposes = {name for node in nodes if node.op_type == "Transpose" for name in node.output}
+    assert not [node.name for node in nodes if node.op_type == "MatMul" and transposes & set(node.input)]
+
+
 class CEstimate(ctypes.Structure):
     _fields_ = [
         ("mean", ctypes.c_double * 6),
