@@ -151,10 +151,9 @@ def whitener(C: Array) -> Array:
 def apply_whitener(W: Array, M: Array) -> Array:
     """Lower-triangular (3, 3, N) times (3, k, N) or (3, N)."""
     w = W if M.ndim == 2 else W[:, :, None]
-    out = np.empty(M.shape)
-    out[0] = w[0, 0] * M[0]
-    out[1] = w[1, 0] * M[0] + w[1, 1] * M[1]
-    out[2] = w[2, 0] * M[0] + w[2, 1] * M[1] + w[2, 2] * M[2]
+    out: Array = w[:, 0] * M[0]
+    out[1:] += w[1:, 1] * M[1]
+    out[2] += w[2, 2] * M[2]
     return out
 
 

@@ -36,7 +36,7 @@ from numpy.typing import NDArray
 
 from gpvo.stats.series import median
 from gpvo.types import Array, StereoCamera
-from gpvo.vo.covariance import Blocks, Gaussians, Sums
+from gpvo.vo.beliefs import Blocks, Gaussians, Sums
 from gpvo.vo.motion import NO_TWIST, Apart, Motion, Whitened, apply_whitener, mistakable, right_velocity
 
 _HIGHEST = 4  # order
@@ -63,7 +63,7 @@ _LATE_S = 2e-3  # of cameras that are not triggered together: software that star
 _MOUNTINGS, _LENSES = (0.3, 1.0, 4.0, 16.0), (0.3, 1.0, 4.0)
 _EXACT_LENS = 0.01  # times as wrong as usual, as good as exact
 _ROLLS = (1.0, 16.0)  # the same of the turn about the optical axis, which rows show at once
-_NEGLIGIBLE = 1e-12  # probability of a kind
+_NEGLIGIBLE = 1e-30  # probability: no variance is so many times another
 _STEP, _STEPS = 5, 20  # motions from one look for a move of the cameras to the next; of those looked back over
 _LIKELY_RAD, _KNOCK_RAD = 1.7e-3, 0.05  # by which a knock turns a camera about each axis, usually and at most
 _JOLT = 0.01  # and by which it moves a lens, in units of the prior
@@ -147,13 +147,10 @@ class RigError:
         self._blocks = tuple(Blocks(precision[part]) for part in (_IN_DX, _IN_DY))
         self._undisputed, self._apart = 0, Apart()  # motions since one was disputed; whether two bodies move
         self._motions, self._past = 0, deque[tuple[tuple[Sums, ...], RigState]](maxlen=_STEPS)
-        covariances = [prior_covariance(camera, *kind) for kind in product(_MOUNTINGS, _LENSES, _ROLLS)]
         # A state from a file is no calibration to return to.
-        self._kinds = Gaussians.of(self.state.mean, np.stack(covariances if known is None else [known.covariance]))
-        self._exact = Gaussians.of(np.zeros(_N), prior_covariance(camera, roll=0.0)[_IN_DY][None])
-        self._exact_lenses = Gaussians.of(
-            self.state.mean, np.stack([prior_covariance(camera, m, _EXACT_LENS) for m in _MOUNTINGS])
-        )
+        self._kinds = _rigs(self.state.mean, camera, _LENSES) if known is None else _rig(known.mean, known.covariance)
+        self._exact = _rig(np.zeros(_N), prior_covariance(camera, roll=0.0)[_IN_DY])
+        self._exact_lenses = _rigs(self.state.mean, camera, (_EXACT_LENS,), (1.0,))
         self.state = self._mixed(np.zeros_like(precision), np.zeros(len(precision)))
 
     def correct(self, uvd: Array, twist: Array | None = None) -> Array:
@@ -295,7 +292,7 @@ class RigError:
             for block, before in zip(self._blocks, sums, strict=True):
                 block.forget(before)
             turned = _KNOCK_RAD**2 * _TURNS @ _TURNS.T + _JOLT**2 * prior_covariance(self._camera)
-            self._kinds = Gaussians.of(state.mean, (state.covariance + turned)[None])
+            self._kinds = _rig(state.mean, state.covariance + turned)
             self.moved += 1
             self._past.clear()
 
@@ -320,30 +317,31 @@ class RigError:
 
     def _mixed(self, information: Array, score: Array) -> RigState:
         """The posterior over rigs of every kind, as one Gaussian of its mean and covariance."""
-        precision, means, evidence = self._kinds.given(information, score)
-        if len(means) == 1:
-            return RigState(means[0], np.asarray(np.linalg.inv(precision[0]), np.float64), 1.0)
+        rigs = self._kinds.given(information, score)
+        means, n_kinds = rigs.mean.reshape(-1, N_COEFFICIENTS), rigs.evidence.size
+        if n_kinds == 1:
+            return RigState(means[0], rigs.C[0], 1.0)
         # A rig whose disparities are exact is as likely as all kinds of others.
-        row_precision, row_means, exact_evidence = self._exact.given(information[N_TERMS:, N_TERMS:], score[_DY])
-        log_weight = np.append(evidence, exact_evidence + np.log(len(evidence)))
+        exact = self._exact.given(information[N_TERMS:, N_TERMS:], score[_DY])
+        log_weight = np.append(rigs.evidence, exact.evidence + np.log(n_kinds))
         weight = np.exp(log_weight - log_weight.max())
         weight /= weight.sum()
-        # Inverting what is most unlikely would cost time and change nothing; one stays, as no variance is zero.
-        likely = weight[:-1] >= min(_NEGLIGIBLE, weight[:-1].max())
-        mean, means = weight[:-1] @ means, means[likely]
-        mean[_DY] += weight[-1] * row_means[0]
-        squares = np.linalg.inv(precision[likely]) + means[:, :, None] * means[:, None]
-        covariance = np.tensordot(weight[:-1][likely], squares, 1)
-        exact = np.linalg.inv(row_precision[0]) + np.outer(row_means[0], row_means[0])
-        covariance[N_TERMS:, N_TERMS:] += weight[-1] * exact
-        covariance[:N_TERMS, :N_TERMS] += weight[-1] * self._untold(information, score, float(exact_evidence[0]))
+        mean, is_exact = weight[:-1] @ means, weight[-1:, None]
+        mean[_DY] += weight[-1] * exact.mean[0, 0]
+        covariance = rigs.covariance(weight[:-1].reshape(rigs.evidence.shape)) + weight[:-1] * means.T @ means
+        if weight[-1] > _NEGLIGIBLE:
+            squares = exact.covariance(is_exact) + weight[-1] * np.outer(exact.mean, exact.mean)
+            covariance[N_TERMS:, N_TERMS:] += squares
+            untold = self._untold(information, score, float(exact.evidence[0, 0]))
+            covariance[:N_TERMS, :N_TERMS] += weight[-1] * untold
         return RigState(mean, covariance - np.outer(mean, mean), float(1.0 - weight[-1]))
 
     def _untold(self, information: Array, score: Array, exact_evidence: float) -> Array:
         """(15, 15) of the disparities of a rig that looks exact: exact lenses tell nothing of how they are mounted."""
-        precision, _, evidence = self._exact_lenses.given(information, score)
-        weight = np.exp(evidence - np.logaddexp.reduce(np.append(evidence, exact_evidence + np.log(len(evidence)))))
-        return np.asarray(np.tensordot(weight, np.linalg.inv(precision)[:, :N_TERMS, :N_TERMS], 1))
+        rigs = self._exact_lenses.given(information, score)
+        evidence = rigs.evidence
+        every = np.append(evidence, exact_evidence + np.log(evidence.size))
+        return rigs.covariance(np.exp(evidence - np.logaddexp.reduce(every)))[:N_TERMS, :N_TERMS]
 
     def _terms(self, uvd: Array, twist: Array, late_s: float = 0.0) -> Array:
         """(2, 16, N) derivatives of dx and of dy by their coefficients, at the place in the right image, from where
@@ -367,6 +365,17 @@ class RigError:
         displaced = mean[:LATE].reshape(2, -1) @ self._at(uvd)
         displaced += mean[LATE] * right_velocity(self.twist if twist is None else twist, uvd, c)
         return -c.fx_px * displaced[0], c.fy_px * displaced[1]
+
+
+def _rig(mean: Array, covariance: Array) -> Gaussians:
+    """One kind of rig, of a mean (n,) and covariance (n, n)."""
+    return Gaussians.of(mean, covariance[None, None])
+
+
+def _rigs(mean: Array, camera: StereoCamera, lenses: Sequence[float], rolls: Sequence[float] = _ROLLS) -> Gaussians:
+    """Kinds of rigs of this mean (31,): a row for each kind of lens."""
+    rows = [[prior_covariance(camera, m, lens, roll) for m, roll in product(_MOUNTINGS, rolls)] for lens in lenses]
+    return Gaussians.of(mean, np.array(rows))
 
 
 def _odds_of_a_turn(state: RigState, information: Array, score: Array) -> float:
