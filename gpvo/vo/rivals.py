@@ -206,11 +206,11 @@ def choose(
         sigma_m.append(expected.sigma_m)
     best, likeliest = int(np.argmax(weight[: len(motions)])), int(np.argmax(weight))
     plausible = best == likeliest
-    if len(candidates) > 1:
-        odds = float(weight[likeliest] - np.delete(weight, likeliest).max())
-    else:
+    on, known = bool(goes_on[best] and not back[best]), plausible and bool(tells[best])
+    if len(candidates) == 1:
         odds = (0.0 if expected is None else expected.odds) + _REGAINED
-    on = bool(goes_on[best] and not back[best])
+        return Choice(best, plausible=plausible, tells=known, odds=min(odds, _SUREST), goes_on=on)
+    odds = float(weight[likeliest] - np.delete(weight, likeliest).max())
     share = np.exp(weight - weight.max())
     share /= share.sum()
     others = 1.0 - share[best]
@@ -222,7 +222,7 @@ def choose(
     otherwise[:3, :3] += share @ np.square(np.where(np.isfinite(sigma_m), sigma_m, 0.0)) * np.eye(3)
     if len(candidates) > len(motions) and expected is not None:
         otherwise[3:, 3:] += share[-1] * expected.C_turn
-    return Choice(best, otherwise, plausible, plausible and bool(tells[best]), min(odds, _SUREST), on)
+    return Choice(best, otherwise, plausible, known, min(odds, _SUREST), on)
 
 
 def _weigh(
