@@ -54,11 +54,11 @@ check: .venv/test-ready
 # The newest patch of each; torch, of which others may bring CUDA along, as in constraints.txt.
 oldest:
 	$(PYTHON) -m venv .venv-oldest
-	sed -n '/^dependencies/,/^\[dependency/p' pyproject.toml | grep -oE '"[a-z0-9-]+>=[0-9.]+' | \
+	sed -n '/^dependencies/,/^\[dependency/p' pyproject.toml | grep -oE '"[A-Za-z0-9._-]+>=[0-9.]+' | \
 	  sed -E 's/"(.*)>=(.*)/\1==\2.*/; /^torch==/d' > .venv-oldest/versions.txt
 	grep '^torch==' constraints.txt >> .venv-oldest/versions.txt
 	.venv-oldest/bin/python -m pip install --quiet --upgrade 'pip>=25.1'
-	.venv-oldest/bin/python -m pip install --quiet --constraint .venv-oldest/versions.txt --editable '.[all]' --group dev
+	.venv-oldest/bin/python -m pip install --quiet --constraint .venv-oldest/versions.txt --editable '.[all,dask,viz]' --group dev
 	OMP_NUM_THREADS=1 .venv-oldest/bin/python -m pytest -n 2 --dist worksteal -m "not slow"
 
 bench: .venv/test-ready

@@ -201,8 +201,7 @@ def bound_chunks() -> None:
         "lz4": LZ4FrameDecompressor,
         "zstd": mcap.zstd.ZstdDecompressor,
     }
-    # Versions of rosbags that have no such table are left as they are.
-    for table in (getattr(ros1, "decompressors", {}), getattr(mcap, "DECOMPRESSORS", {})):
+    for table in (ros1.decompressors, mcap.DECOMPRESSORS):
         table.update({name: partial(unpacked, new=of[name]) for name in of.keys() & table.keys()})
 
 
