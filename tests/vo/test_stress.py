@@ -461,11 +461,11 @@ def test_what_moves_with_the_camera() -> None:
 @pytest.mark.slow
 @pytest.mark.skipif("GPVO_DATA" not in os.environ, reason="GPVO_DATA names no folder of real data")
 def test_what_moves_with_the_camera_on_a_drive() -> None:
-    """Thirty frames of KITTI raw 0001, about 10 m/s. A drive that begins with a bonnet over 40 % is taken for rest."""
+    """Thirty frames of KITTI raw 0001, about 10 m/s. With a bonnet over 40 % it may be at rest: the covariance counts
+    both."""
     whole = drive()
     found = held(stress.Footage(whole.camera, whole.frames[:30], whole.T_world_cam[:30]))
-    assert sum(len(found[fault].silent) for fault in SEEN_THROUGH) == 0
-    assert sum(len(found[fault].wrong) for fault in SEEN_THROUGH if "40" not in fault) == 0
+    assert sum(len(found[fault].wrong) for fault in SEEN_THROUGH) == 0
 
 
 PARTS = ((0, 60), (20, 60), (45, 108))
