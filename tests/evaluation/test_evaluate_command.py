@@ -331,6 +331,9 @@ def test_a_report_replaces_an_earlier_one_and_nothing_else(run_folder, tmp_path)
     assert [gpvo("report", run_folder, "-o", page)[0] for _ in range(2)] == [0, 0]
 
 
+@pytest.mark.skipif(
+    np.lib.NumpyVersion(np.__version__) < "2.0.0", reason="the last bits of this NumPy differ from one array to the next"
+)
 def test_the_offset_that_evaluate_advises_is_an_option_of_train(tmp_path):
     """Of a truth on another clock, with it, a model is that of the truth on the log's, to the bit."""
     late_s, models = 0.25, {}
@@ -347,10 +350,8 @@ def test_the_offset_that_evaluate_advises_is_an_option_of_train(tmp_path):
         models[name], header = modelfile.load(tmp_path / f"{name}.gpvo")
         assert header["config"].get("time_offset_s", 0.0) == {"own": 0.0, "late": late_s, "auto": None}[name]
     assert models["own"].keys() == models["late"].keys()
-    # The sums of older versions depend on where arrays lie in memory.
-    rtol = 0.0 if np.lib.NumpyVersion(np.__version__) >= "2.0.0" else 1e-8
     for name, array in models["own"].items():
-        np.testing.assert_allclose(array, models["late"][name], rtol=rtol, atol=0.0)
+        np.testing.assert_array_equal(array, models["late"][name])
     np.testing.assert_allclose(
         models["auto"]["method.constant"], models["own"]["method.constant"], rtol=0.05, atol=1e-7
     )
