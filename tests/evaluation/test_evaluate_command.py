@@ -332,7 +332,7 @@ def test_a_report_replaces_an_earlier_one_and_nothing_else(run_folder, tmp_path)
 
 
 @pytest.mark.skipif(
-    np.lib.NumpyVersion(np.__version__) < "2.0.0", reason="the last bits of this NumPy differ from one array to the next"
+    np.lib.NumpyVersion(np.__version__) < "2.0.0", reason="the last bits differ from array to array in this NumPy"
 )
 def test_the_offset_that_evaluate_advises_is_an_option_of_train(tmp_path):
     """Of a truth on another clock, with it, a model is that of the truth on the log's, to the bit."""
